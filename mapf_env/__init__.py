@@ -1,0 +1,63 @@
+"""The world: instances, the rules of motion and perception, and the PettingZoo environment.
+
+Importing it registers the environment as `mapf/grid-v0` with PettingZoo.
+"""
+
+import pettingzoo
+
+from mapf_env.ascii_map import parse_instance, parse_map
+from mapf_env.batched_env import BatchedEnv, Observation, Step
+from mapf_env.config import EnvConfig
+from mapf_env.generation import random_cases, random_instance, random_map, random_maps
+from mapf_env.grid_v0 import ENV_ID, GridEnv, env, parallel_env
+from mapf_env.instance import Instance
+from mapf_env.instance_set import instance_hash, load_instances, save_instances
+from mapf_env.joint_v0 import JointEnv, joint_env
+from mapf_env.movingai import load_map, load_scen, save_map, save_scen
+from mapf_env.render import animate, draw
+from mapf_env.replay import replay
+from mapf_env.rewards import SCHEMES, Rewards
+from mapf_env.rules import Edges, communication_edges, communication_graph
+from mapf_env.solution import MOVES, Action, Conflict, Solution
+
+__all__ = [
+    "MOVES",
+    "SCHEMES",
+    "Action",
+    "BatchedEnv",
+    "Conflict",
+    "Edges",
+    "EnvConfig",
+    "GridEnv",
+    "Instance",
+    "JointEnv",
+    "Observation",
+    "Rewards",
+    "Solution",
+    "Step",
+    "animate",
+    "communication_edges",
+    "communication_graph",
+    "draw",
+    "env",
+    "instance_hash",
+    "joint_env",
+    "load_instances",
+    "load_map",
+    "load_scen",
+    "parallel_env",
+    "parse_instance",
+    "parse_map",
+    "random_cases",
+    "random_instance",
+    "random_map",
+    "random_maps",
+    "replay",
+    "save_instances",
+    "save_map",
+    "save_scen",
+]
+
+if ENV_ID not in pettingzoo.parallel_registry:
+    pettingzoo.register("parallel", ENV_ID, "mapf_env.grid_v0:parallel_env")
+    pettingzoo.register("aec", ENV_ID, "mapf_env.grid_v0:env")

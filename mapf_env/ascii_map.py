@@ -1,0 +1,55 @@
+"""Maps as they are drawn in text: one's own, in a test or a notebook."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from mapf_env.instance import Instance, Obstacles
+
+
+def parse_map(drawing: str) -> Obstacles:
+    """The grid (H, W) of a drawing: `#` or `@` is an obstacle, everything else free; blank lines around it are cut.
+
+    Raises:
+        ValueError: If there are no cells, or the lines differ in length.
+    """
+    return np.isin(_characters(drawing), ["#", "@"])
+
+
+def parse_instance(drawing: str) -> Instance:
+    """The problem of a drawing: `A` to `Z` are robots, `a` to `z` their goals, `#` or `@` obstacles, `.` free cells.
+
+    A robot whose goal is not drawn has it where it stands. Robots are numbered in the order of their letters.
+
+    Raises:
+        ValueError: If a letter occurs twice, a goal has no robot, or the problem is ill formed.
+    """
+    cells = _characters(drawing)
+    places: dict[str, tuple[int, int]] = {}
+    for row, col in np.argwhere(np.char.isalpha(cells)).tolist():
+        letter = str(cells[row, col])
+        if letter in places:
+            raise ValueError(f"the letter {letter} stands at {places[letter]} and at {(row, col)}; draw it once")
+        places[letter] = (row, col)
+    robots = sorted(letter for letter in places if letter.isupper())
+    strays = sorted(letter for letter in places if letter.islower() and letter.upper() not in places)
+    if strays:
+        raise ValueError(f"the goal {strays[0]} has no robot {strays[0].upper()}; draw one")
+    starts = [places[robot] for robot in robots]
+    goals = [places.get(robot.lower(), places[robot]) for robot in robots]
+    return Instance(parse_map(drawing), np.reshape(starts, (-1, 2)).astype(int), np.reshape(goals, (-1, 2)).astype(int))
+
+
+def _characters(drawing: str) -> np.ndarray[tuple[int, int], np.dtype[np.str_]]:
+    lines = [line.strip() for line in drawing.strip().splitlines()]
+    if not lines:
+        raise ValueError("the drawing has no cells; draw at least one line")
+    for number, line in enumerate(lines, start=1):
+        if len(line) != len(lines[0]):
+            raise ValueError(f"line {number} has {len(line)} cells, line 1 has {len(lines[0])}; make them equal")
+        unknown = re.search("[^#@.A-Za-z]", line)
+        if unknown:
+            raise ValueError(f"line {number}: unknown character {unknown.group()!r}; draw # @ . and letters")
+    return np.array([list(line) for line in lines])

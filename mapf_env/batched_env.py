@@ -1,0 +1,357 @@
+"""Many environments, stepped in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode
+
+from mapf_env import _native, rules
+from mapf_env.config import CHANNELS, EnvConfig
+from mapf_env.generation import random_cases, random_maps
+from mapf_env.instance import Instance
+from mapf_env.team_state import TeamState
+
+_FLOAT = np.dtype(np.float32)
+
+
+class Observation(NamedTuple):
+    """What the robots of B teams perceive; C = 3 + extra channels."""
+
+    fov: npt.NDArray[Any]
+    """(B, N, C, F, F) fields of view."""
+    graph: npt.NDArray[np.float32]
+    """(B, N, N) communication graph; row i says whom robot i hears."""
+
+
+class Step(NamedTuple):
+    """The outcome of one joint step of B teams."""
+
+    observation: Observation
+    rewards: npt.NDArray[np.float32]
+    """(B, N) by default 0 for a robot that is on its goal after the step, else -1.
+
+    If no robot leaves its goal again, a team's undiscounted return is its negated flowtime but for a constant, the
+    number of robots that did not start on their goals: the step that arrives is free.
+    """
+    terminated: npt.NDArray[np.bool_]
+    """(B,) all robots of the team are on their goals at once; never in lifelong tasks."""
+    truncated: npt.NDArray[np.bool_]
+    """(B,) max_cycles is reached without that."""
+    replaced: npt.NDArray[np.bool_]
+    """(B, N) the shield replaced the robot's action."""
+    arrived: npt.NDArray[np.bool_]
+    """(B, N) the robot has come to its goal in this step; in lifelong tasks their sum is the throughput."""
+
+
+class BatchedEnv:
+    """B environments in arrays; the settings are the fields of `EnvConfig`.
+
+    All robots of a team live until its joint end. A team that has ended must be reset before the next step, unless
+    `autoreset` does it.
+
+    Args:
+        num_envs: The number of environments B.
+        threads: Over how many threads the environments of a step are spread; it changes no result.
+        autoreset: As in Gymnasium: DISABLED; NEXT_STEP, the step after the end ignores the actions and begins the next
+            episode; or SAME_STEP, the step that ends returns the first observation of the next episode, and
+            `final_observation` has the last ones of those that ended.
+        cases: Instances to play, drawn anew at each reset by the seed, in place of random ones.
+        fill: Take instances that are smaller than the environment too: the map is filled up with obstacles, and the
+            robots that are not there have zeros everywhere; `present` says which are.
+        settings: Fields of `EnvConfig`.
+
+    Raises:
+        ValueError: If a setting is out of range.
+        TypeError: If a setting is unknown.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        threads: int = 1,
+        autoreset: AutoresetMode = AutoresetMode.DISABLED,
+        cases: Sequence[Instance] | None = None,
+        fill: bool = False,
+        **settings: Any,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if threads < 1:
+            raise ValueError(f"threads must be at least 1, got {threads}")
+        if cases is not None and not cases:
+            raise ValueError("there are no cases to play: give some, or None for random instances")
+        self.num_envs, self.threads, self.fill = num_envs, threads, fill
+        self.autoreset = AutoresetMode(autoreset)
+        self.config = config = EnvConfig(**settings)
+        self._cases = cases
+        if cases is not None:
+            self._stack(cases)  # refuses what does not fit
+        self.final_observation: Observation | None = None
+        self._fov_shape = (num_envs, config.num_agents, config.num_channels, config.fov_side, config.fov_side)
+        self._graph_shape = (num_envs, config.num_agents, config.num_agents)
+        self._dtype = np.dtype(config.dtype)
+        self._state = TeamState.empty(num_envs, config)
+        self._bind()
+
+    def _bind(self) -> None:
+        config = self.config
+        stepper = _native.StepperFloat32 if config.dtype == "float32" else _native.StepperUint8
+        self.stepper = stepper(
+            self._state,
+            pad=config.fov_radius,
+            pibt=config.shield == "pibt",
+            lifelong=config.task == "lifelong",
+            max_cycles=config.max_cycles,
+            weights=int(config.comm_weights == "distance"),
+            message_loss=config.message_loss,
+            extras=[CHANNELS.index(channel) for channel in config.extra_channels],
+            rewards=list(config.rewards),
+            threads=self.threads,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "stepper"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._bind()
+
+    @property
+    def num_agents(self) -> int:
+        """The number of robots N in each team."""
+        return self.config.num_agents
+
+    @property
+    def grids(self) -> npt.NDArray[np.bool_]:
+        """(B, H, W) the maps, True is an obstacle; a copy."""
+        return self._state.grids.copy()
+
+    @property
+    def positions(self) -> npt.NDArray[np.int32]:
+        """(B, N, 2) where the robots stand; a copy."""
+        return self._state.positions.copy()
+
+    @property
+    def goals(self) -> npt.NDArray[np.int32]:
+        """(B, N, 2) where the robots want to go; a copy."""
+        return self._state.goals.copy()
+
+    @property
+    def times(self) -> npt.NDArray[np.int64]:
+        """(B,) steps since each team's reset; a copy."""
+        return self._state.times.copy()
+
+    @property
+    def comm_radius(self) -> npt.NDArray[np.float64]:
+        """(B,) robots closer than this hear each other; a copy."""
+        return self._state.comm_radius.copy()
+
+    @property
+    def present(self) -> npt.NDArray[np.bool_]:
+        """(B, N) which robots are there."""
+        return np.arange(self.num_agents) < self._state.team_sizes[:, None]
+
+    @property
+    def began(self) -> bool:
+        """Whether all environments have been reset."""
+        return bool(self._state.started.all())
+
+    def buffers(self) -> Observation:
+        """Memory for observations, to be given as `out`."""
+        return Observation(np.empty(self._fov_shape, self._dtype), np.empty(self._graph_shape, _FLOAT))
+
+    def reset(
+        self,
+        seed: int | Sequence[int] | None = None,
+        *,
+        instances: Sequence[Instance] | None = None,
+        mask: npt.NDArray[np.bool_] | None = None,
+        out: Observation | None = None,
+    ) -> Observation:
+        """Begin new episodes and return what the robots perceive.
+
+        Args:
+            seed: Restarts the random streams of the environments that are reset: environment b gets seed + b, or the
+                b-th of a sequence of B. Without a seed each goes on with its stream (the first time, from a random
+                seed).
+            instances: One instance for each environment that is reset, in place of random ones.
+            mask: (B,) which environments begin anew; all if not given. The others go on undisturbed.
+            out: Where to write the observation of all environments, as for `step`.
+
+        Raises:
+            ValueError: If a length or shape does not fit, or an instance is of another size than the environment;
+                the environments are then as they were.
+        """
+        chosen = np.arange(self.num_envs) if mask is None else np.flatnonzero(self._checked_mask(mask))
+        self._begin(chosen, None if seed is None else self._checked_seeds(seed)[chosen], instances)
+        self._state.replaced[chosen] = self._state.arrived[chosen] = False
+        self.final_observation = None
+        return self._observe(out)
+
+    def _begin(
+        self, chosen: npt.NDArray[np.intp], streams: npt.NDArray[np.uint64] | None, instances: Sequence[Instance] | None
+    ) -> None:
+        state, config, pad = self._state, self.config, self.config.fov_radius
+        episodes = state.episodes[chosen] if streams is None else np.zeros_like(chosen, np.uint64)
+        streams = state.streams[chosen] if streams is None else streams
+        seeds = _native.mix(streams, episodes)
+        if instances is None and self._cases is not None:
+            draws = _native.mix(seeds, np.full_like(seeds, np.iinfo(np.uint64).max)) % np.uint64(len(self._cases))
+            instances = [self._cases[i] for i in draws.tolist()]
+        where = slice(None) if len(chosen) == self.num_envs else chosen
+        sizes = np.int32(config.num_agents)
+        if instances is None:
+            grids, starts, goals = self._draw(seeds)
+        else:
+            if len(instances) != len(chosen):
+                raise ValueError(f"{len(instances)} instances for {len(chosen)} environments: give one for each")
+            grids, starts, goals, sizes = self._stack(instances)
+        begun: dict[str, Any] = {"comm_radius": np.float64(config.comm_radius)}
+        if config.comm_range == "connected":
+            teams = [team[:size] for team, size in zip(starts, np.broadcast_to(sizes, len(starts)), strict=True)]
+            begun["comm_radius"] = [rules.connecting_radius(team, config.comm_radius) for team in teams]
+        if config.task == "lifelong" or config.needs_distances:
+            obstacles = rules.bordered(grids, pad, np.uint8)
+            if config.task == "lifelong":
+                begun["regions"] = _native.regions(obstacles, pad)
+            if config.needs_distances:
+                begun["distances"] = rules.distance_tables(obstacles, pad, goals)
+        state.obstacles[where, pad:-pad, pad:-pad] = grids
+        state.streams[where], state.episodes[where] = streams, episodes + np.uint64(1)
+        state.begin(
+            where,
+            seeds=seeds,
+            grids=grids,
+            team_sizes=sizes,
+            positions=starts,
+            previous=starts,
+            goals=goals,
+            on_goal=(starts == goals).all(axis=2) & (np.arange(config.num_agents) < np.reshape(sizes, (-1, 1))),
+            started=True,
+            **begun,
+        )
+
+    def step(self, actions: npt.ArrayLike, out: Observation | None = None) -> Step:
+        """Shield and execute the joint actions (B, N), integers 0..4.
+
+        Args:
+            actions: One of the five actions for each robot; under the shield "pibt" alternatively a value for each of
+                them, (B, N, 5), for example logits: the greatest is wanted most.
+            out: Where to write the observation, NumPy arrays or torch tensors on the CPU shaped as in `buffers()`; it
+                is what is returned then. Fresh arrays if not given.
+
+        Raises:
+            ValueError: If the shape is wrong or an action is out of range.
+            TypeError: If the actions are not integers, or the memory is of another dtype.
+            RuntimeError: Before the first reset, or if a team has ended and was not reset.
+        """
+        observation = self.buffers() if out is None else out
+        self.advance(np.asarray(actions), observation)
+        state = self._state
+        return Step(
+            observation,
+            state.rewards.copy(),
+            state.terminated.copy(),
+            state.truncated.copy(),
+            state.replaced.copy(),
+            state.arrived.copy(),
+        )
+
+    def advance(self, actions: npt.NDArray[Any], out: Observation) -> None:
+        """`step` without copies of the outcome, which stands in the state."""
+        if self.autoreset is AutoresetMode.DISABLED:
+            self._execute(actions, out, skip_ended=False)
+            return
+        state = self._state
+        due = state.ended.copy()
+        self._execute(actions, out, skip_ended=self.began)
+        self.final_observation = None
+        if self.autoreset is AutoresetMode.SAME_STEP:
+            due = state.ended.copy()
+            if due.any():
+                self.final_observation = Observation(*(np.asarray(part)[due] for part in out))
+        if due.any():
+            self._begin(np.flatnonzero(due), None, None)
+            self.stepper.observe(*out, due)
+
+    def _execute(self, actions: npt.NDArray[Any], out: Observation, *, skip_ended: bool) -> None:
+        if actions.ndim == 3:
+            self.stepper.step_by_values(rules.as_values(actions), *out, skip_ended)
+        elif actions.ndim == 2:
+            self.stepper.step(rules.as_actions(actions), *out, skip_ended)
+        else:
+            raise ValueError(f"actions must have shape ({self.num_envs}, {self.num_agents}), got {actions.shape}")
+
+    def observe(self, out: Observation | None = None) -> Observation:
+        """What the robots perceive now.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        if not self.began:
+            raise RuntimeError("there is nothing to observe before the first reset: call reset()")
+        return self._observe(out)
+
+    def _observe(self, out: Observation | None) -> Observation:
+        observation = self.buffers() if out is None else out
+        self.stepper.observe(*observation, None)
+        return observation
+
+    def edges(self, graph: npt.NDArray[np.float32]) -> rules.Edges:
+        """The graph (B, N, N) of an observation as lists of edges, with each neighbour's relative position."""
+        return rules.communication_edges(graph, self._state.positions)
+
+    def on_goal(self) -> npt.NDArray[np.bool_]:
+        """(B, N) which robots stand on their goals."""
+        return self._state.on_goal.copy()
+
+    def action_mask(self) -> npt.NDArray[np.int8]:
+        """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle."""
+        self.stepper.write_action_masks()
+        return self._state.action_mask.copy()
+
+    def _checked_seeds(self, seed: int | Sequence[int]) -> npt.NDArray[np.uint64]:
+        seeds = [int(seed) + b for b in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != self.num_envs or not all(0 <= each < 2**64 for each in seeds):
+            raise ValueError(f"give one non-negative seed or {self.num_envs} of them, below 2**64, got {seed!r}")
+        return np.array(seeds, np.uint64)
+
+    def _checked_mask(self, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        array = np.asarray(mask)
+        if array.shape != (self.num_envs,) or array.dtype != np.bool_:
+            raise ValueError(f"mask must be bool of shape ({self.num_envs},), got {array.dtype} of shape {array.shape}")
+        return array
+
+    def _draw(self, seeds: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.bool_], rules.Positions, rules.Positions]:
+        config = self.config
+        grids = random_maps(seeds, height=config.height, width=config.width, density=config.density, style=config.style)
+        return grids, *random_cases(seeds, grids, config.num_agents)
+
+    def _stack(
+        self, instances: Sequence[Instance]
+    ) -> tuple[npt.NDArray[np.bool_], rules.Positions, rules.Positions, npt.NDArray[np.int32]]:
+        config = self.config
+        grids = np.ones((len(instances), config.height, config.width), np.bool_)
+        starts, goals = (np.zeros((len(instances), config.num_agents, 2), np.int32) for _ in range(2))
+        sizes = np.empty(len(instances), np.int32)
+        for b, instance in enumerate(instances):
+            robots, (height, width) = instance.num_agents, instance.grid.shape
+            if robots > config.num_agents or (robots < config.num_agents and not self.fill):
+                raise ValueError(
+                    f"the instance has {robots} agents, the environment {config.num_agents}: "
+                    f"make it with num_agents={robots}"
+                )
+            small = height < config.height or width < config.width
+            if height > config.height or width > config.width or (small and not self.fill):
+                raise ValueError(
+                    f"the instance's map is {height}x{width}, the environment's {config.height}x{config.width}: "
+                    f"make it with height={height}, width={width}"
+                )
+            grids[b, :height, :width] = instance.grid
+            starts[b, :robots], goals[b, :robots], sizes[b] = instance.starts, instance.goals, robots
+        return grids, starts, goals, sizes

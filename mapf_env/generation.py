@@ -1,0 +1,109 @@
+"""Random maps and instances, reproducible from a seed on every platform."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from mapf_env import _native
+from mapf_env.instance import Instance, Obstacles, as_obstacles
+
+MapStyle = Literal["cells", "walls", "maze", "room", "warehouse", "empty"]
+STYLES: tuple[MapStyle, ...] = ("cells", "walls", "maze", "room", "warehouse", "empty")
+"""In the native core's order."""
+Seeds = npt.NDArray[np.uint64]
+
+
+def random_maps(
+    seeds: npt.ArrayLike, *, height: int = 20, width: int = 20, density: float = 0.1, style: MapStyle = "cells"
+) -> Obstacles:
+    """Maps (B, H, W), True is an obstacle, one for each of B seeds; the free cells of a map are connected.
+
+    Args:
+        seeds: (B,) unsigned integers.
+        height: Rows H.
+        width: Columns W.
+        density: Share of obstacles; maps of the styles "cells" and "walls" have exactly round(density * H * W) of them,
+            the others as many as the style has.
+        style: "cells" blocks independent cells, "walls" builds short walls between cells with even coordinates as the
+            paper's released generator does. "maze" has corridors one cell wide with some ways round, "room" rooms of
+            5 x 5 cells with a door between any two neighbours, "warehouse" shelves of 2 x 10 cells with aisles one cell
+            wide (always the same), "empty" no obstacles.
+
+    Raises:
+        ValueError: If the density leaves no room, or the style cannot reach it.
+    """
+    if height < 1 or width < 1:
+        raise ValueError(f"a map needs at least one row and one column, got height={height} and width={width}")
+    if not 0.0 <= density < 1.0:
+        raise ValueError(f"density must lie in [0, 1), got {density}")
+    if style not in STYLES:
+        raise ValueError(f"style must be one of {', '.join(STYLES)}, got {style!r}")
+    obstacles = round(density * height * width)
+    return _native.random_maps(_as_seeds(seeds), height, width, obstacles, STYLES.index(style))
+
+
+def random_cases(
+    seeds: npt.ArrayLike, grids: npt.NDArray[np.bool_], num_agents: int
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """Starts and goals, each (B, N, 2), for each of B seeds on its grid of `grids` (B, H, W).
+
+    Starts are distinct, goals are distinct, no robot starts on its own goal, and all lie in the largest connected free
+    region, over which they are uniform.
+
+    Raises:
+        ValueError: If a region is too small for that many robots.
+    """
+    if num_agents < 1:
+        raise ValueError(f"num_agents must be at least 1, got {num_agents}")
+    return _native.place_agents(_as_seeds(seeds), np.ascontiguousarray(grids), num_agents)
+
+
+def random_map(
+    *, height: int = 20, width: int = 20, density: float = 0.1, style: MapStyle = "cells", seed: int | None = None
+) -> Obstacles:
+    """One map (H, W) as `random_maps` makes them; without a seed, a different one at each call."""
+    return random_maps([_one_seed(seed)], height=height, width=width, density=density, style=style)[0]
+
+
+def random_instance(
+    *,
+    height: int = 20,
+    width: int = 20,
+    density: float = 0.1,
+    num_agents: int = 10,
+    style: MapStyle = "cells",
+    grid: npt.ArrayLike | None = None,
+    seed: int | None = None,
+) -> Instance:
+    """A random instance, on a random map or on `grid` (H, W) if that is given.
+
+    The map depends on the seed and the map's arguments alone: another number of agents gives the same map.
+
+    Raises:
+        ValueError: If the map has no room for the robots, or the density leaves none.
+    """
+    seeds = np.array([_one_seed(seed)], dtype=np.uint64)
+    if grid is None:
+        grids = random_maps(seeds, height=height, width=width, density=density, style=style)
+    else:
+        grids = as_obstacles(grid)[None]
+    starts, goals = random_cases(seeds, grids, num_agents)
+    return Instance(grids[0], starts[0], goals[0])
+
+
+def _one_seed(seed: int | None) -> int:
+    if seed is None:
+        return int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
+    if not 0 <= seed < 2**64:
+        raise ValueError(f"seed must not be negative and fit into 64 bits, got {seed}")
+    return seed
+
+
+def _as_seeds(seeds: npt.ArrayLike) -> Seeds:
+    array = np.asarray(seeds)
+    if array.ndim != 1 or not (np.issubdtype(array.dtype, np.integer) and (array >= 0).all()):
+        raise ValueError(f"seeds must be a vector of non-negative integers, got {array.dtype} of shape {array.shape}")
+    return np.ascontiguousarray(array, dtype=np.uint64)

@@ -1,0 +1,273 @@
+"""The PettingZoo environment `mapf/grid-v0`: one team of robots on a grid, all acting at once."""
+
+from __future__ import annotations
+
+import copy
+from operator import index
+from typing import Any, Literal, SupportsIndex
+
+import numpy as np
+import numpy.typing as npt
+import pettingzoo
+from gymnasium import spaces
+from pettingzoo.utils.conversions import parallel_to_aec
+
+from mapf_env import _native
+from mapf_env.batched_env import BatchedEnv, Observation
+from mapf_env.config import EnvConfig
+from mapf_env.instance import Instance
+from mapf_env.pixels import picture, text
+
+ENV_ID = "mapf/grid-v0"
+
+
+class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
+    """A team of robots with local views and local communication, stepped under a collision shield.
+
+    Every agent observes `{"fov": (C, F, F), "graph": (N,)}`: its field of view and its row of the communication graph.
+    All agents live until the joint end: terminated once all are on their goals at the same time, truncated after
+    `max_cycles` steps. Infos carry `action_mask` (5,), `replaced` (the shield changed the action) and `on_goal`, in
+    lifelong tasks `arrived` too.
+
+    Args:
+        observation: "dict", or "box" for the field of view alone.
+        preferences: An action is a value for each of the five moves, (5,) float32, in place of one of them; this needs
+            shield="pibt".
+        reuse_buffers: Return the same dictionaries and arrays at every step, overwritten; faster, for loops that keep
+            nothing.
+        render_mode: "ansi" gives text, "rgb_array" a picture (H', W', 3), "human" prints the text at each step.
+        settings: Fields of `mapf_env.EnvConfig`.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "name": "mapf_grid_v0",
+        "render_modes": ["ansi", "rgb_array", "human"],
+        "render_fps": 4,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        *,
+        observation: Literal["dict", "box"] = "dict",
+        preferences: bool = False,
+        reuse_buffers: bool = False,
+        render_mode: Literal["ansi", "rgb_array", "human"] | None = None,
+        **settings: Any,
+    ) -> None:
+        if observation not in ("dict", "box"):
+            raise ValueError(f"observation must be dict or box, got {observation!r}")
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode must be ansi, rgb_array, human or None, got {render_mode!r}")
+        self._batch = BatchedEnv(1, **settings)
+        self.config = config = self._batch.config
+        if preferences and config.shield != "pibt":
+            raise ValueError('preferences over all five moves need shield="pibt"')
+        self._observation, self._preferences, self._reuse = observation, preferences, reuse_buffers
+        self.render_mode = render_mode
+        N, (H, W) = config.num_agents, (config.height, config.width)
+        self.possible_agents = [f"agent_{i}" for i in range(N)]
+        self.agents: list[str] = []
+        fov, graph = fov_space(config), spaces.Box(0.0, 1.0, (N,), np.float32)
+        both = spaces.Dict({"fov": fov, "graph": graph})
+        moves = spaces.Box(-np.inf, np.inf, (5,), np.float32) if preferences else spaces.Discrete(5)
+        self.observation_spaces = {
+            agent: copy.deepcopy(both if observation == "dict" else fov) for agent in self.possible_agents
+        }
+        self.action_spaces = {agent: copy.deepcopy(moves) for agent in self.possible_agents}
+        self.state_space = spaces.Box(0.0, 1.0, (3, H, W), np.float32)
+        self._masks_shape = (N, 5)
+        self._reused: _Reused | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_reused": None}  # its dictionaries share the memory of its arrays
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The space of an agent's observation; the same object at every call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The five moves: up, left, down, right, idle."""
+        return self.action_spaces[agent]
+
+    @property
+    def grid(self) -> npt.NDArray[np.bool_]:
+        """(H, W) the map, True is an obstacle; a copy."""
+        return self._batch.grids[0]
+
+    @property
+    def positions(self) -> npt.NDArray[np.int32]:
+        """(N, 2) row and column of each robot; a copy."""
+        return self._batch.positions[0]
+
+    @property
+    def goals(self) -> npt.NDArray[np.int32]:
+        """(N, 2) row and column of each robot's goal; a copy."""
+        return self._batch.goals[0]
+
+    def instance(self) -> Instance:
+        """The problem seen from here: the current positions are its starts."""
+        if not self.agents:
+            raise RuntimeError("there is no episode: call reset() first")
+        return Instance(self.grid, self.positions, self.goals)
+
+    def state(self) -> npt.NDArray[np.float32]:
+        """(3, H, W) all there is: obstacles, robots and goals; robot i and its goal are drawn as (i + 1) / N.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        if not self._batch.began:
+            raise RuntimeError("there is no state before the first reset: call reset()")
+        planes = np.zeros(self.state_space.shape, np.float32)
+        planes[0] = self.grid
+        numbers = np.arange(1, self._batch.num_agents + 1, dtype=np.float32) / np.float32(self._batch.num_agents)
+        for plane, cells in ((1, self.positions), (2, self.goals)):
+            planes[plane, cells[:, 0], cells[:, 1]] = numbers
+        return planes
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Begin an episode: a fresh random instance, or `options["instance"]`.
+
+        Raises:
+            ValueError: If the instance does not fit the environment.
+            TypeError: If `options["instance"]` is no `Instance`.
+        """
+        instance = (options or {}).get("instance")
+        if instance is not None and not isinstance(instance, Instance):
+            raise TypeError(f'options["instance"] must be a mapf_env.Instance, got {type(instance).__name__}')
+        if self._reuse and self._reused is None:
+            self._reused = _Reused(self)
+        reused = self._reused
+        buffers = self._batch.buffers() if reused is None else reused.buffers
+        self._batch.reset(seed, instances=None if instance is None else [instance], out=buffers)
+        self.agents = list(self.possible_agents)
+        if reused is None:
+            observations, infos, masks = self._fresh(*buffers)
+        else:
+            (observations, *_, infos), masks = reused.returned, reused.masks
+        masks[:] = self._batch.action_mask()[0]
+        self._batch.stepper.outcome_by_agent(self.agents, {}, {}, {}, infos)
+        if self.render_mode == "human":
+            self.render()
+        return observations, infos
+
+    def step(
+        self, actions: dict[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Execute one action for each agent.
+
+        Raises:
+            RuntimeError: Before the first reset or after the end of the episode.
+            ValueError: If agents are missing or unknown, or an action is out of range.
+            TypeError: If an action is not an integer.
+        """
+        agents = self.agents
+        if not agents:
+            raise RuntimeError("the episode has not begun or has ended: call reset() before step()")
+        if self._reuse and self._reused is None:  # a copy made in the middle of an episode
+            self._reused = _Reused(self)
+        batch, reused = self._batch, self._reused
+        if reused is None:
+            fov, graph = batch.buffers()
+            observations, infos, masks = self._fresh(fov, graph)
+            rewards, terminated, truncated = {}, {}, {}
+        else:
+            (fov, graph), masks = reused.buffers, reused.masks
+            observations, rewards, terminated, truncated, infos = reused.returned
+        stepper, outcome = batch.stepper, (rewards, terminated, truncated, infos)
+        ended = None
+        if not self._preferences:
+            ended = stepper.step_agents(actions, agents, fov, graph, masks, *outcome)
+        if ended is None:
+            wanted = np.array([self._checked(actions)], np.float32 if self._preferences else np.int64)
+            batch.advance(wanted, Observation(fov, graph))
+            masks[:] = batch.action_mask()[0]
+            ended = stepper.outcome_by_agent(agents, *outcome)
+        if ended:
+            self.agents = []
+        if self.render_mode == "human":
+            self.render()
+        return observations, rewards, terminated, truncated, infos
+
+    def render(self) -> str | npt.NDArray[np.uint8] | None:
+        """The current state as `render_mode` has it; None without one and for "human".
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        if self.render_mode is None:
+            return None
+        if not self._batch.began:
+            raise RuntimeError("there is nothing to render before the first reset: call reset()")
+        if self.render_mode == "rgb_array":
+            return picture(self.grid, self.positions, self.goals)
+        shown = text(self.grid, self.positions, self.goals)
+        if self.render_mode == "ansi":
+            return shown
+        print(shown)
+        return None
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _fresh(
+        self, fov: npt.NDArray[Any], graph: npt.NDArray[np.float32]
+    ) -> tuple[dict[str, Any], dict[str, Any], npt.NDArray[np.int8]]:
+        """Observations and infos by agent, whose arrays are rows of (1, N, C, F, F), (1, N, N) and masks (N, 5)."""
+        agents, rows = self.possible_agents, _native.rows_by_agent
+        masks = np.empty(self._masks_shape, np.int8)
+        names, columns = (("fov", "graph"), (fov[0], graph[0])) if self._observation == "dict" else ((), (fov[0],))
+        return rows(agents, names, columns), rows(agents, ("action_mask",), (masks,)), masks
+
+    def _checked(self, actions: dict[str, Any]) -> list[Any]:
+        """The actions in the order of agents, or what is wrong with them."""
+        if actions.keys() != set(self.agents):
+            missing, unknown = set(self.agents) - actions.keys(), actions.keys() - set(self.agents)
+            raise ValueError(f"give one action for each agent; missing: {sorted(missing)}, unknown: {sorted(unknown)}")
+        if not self._preferences:
+            return [_as_action(agent, actions[agent]) for agent in self.agents]
+        for agent in self.agents:
+            if np.shape(actions[agent]) != (5,):
+                raise ValueError(f"the action of {agent} must be a value for each of the five moves")
+        return [actions[agent] for agent in self.agents]
+
+
+class _Reused:
+    """What a `GridEnv` returns at every step if it reuses its buffers: dictionaries whose arrays are rows of these."""
+
+    def __init__(self, env: GridEnv) -> None:
+        self.buffers = env._batch.buffers()
+        observations, infos, self.masks = env._fresh(*self.buffers)
+        self.returned: tuple[dict[str, Any], ...] = (observations, {}, {}, {}, infos)
+
+
+def fov_space(config: EnvConfig) -> spaces.Box:
+    """The values of a robot's view (C, F, F)."""
+    low, high = np.zeros(config.num_channels), np.ones(config.num_channels)
+    if "cost_to_go" in config.extra_channels:
+        channel = 3 + config.extra_channels.index("cost_to_go")
+        low[channel], high[channel] = (0, 4 * config.fov_radius) if config.dtype == "uint8" else (-1, 1)
+    shape = (config.num_channels, config.fov_side, config.fov_side)
+    dtype = np.uint8 if config.dtype == "uint8" else np.float32
+    bounds = [np.broadcast_to(bound[:, None, None], shape).astype(dtype) for bound in (low, high)]
+    return spaces.Box(bounds[0], bounds[1], shape, dtype)
+
+
+def _as_action(agent: str, action: SupportsIndex) -> int:
+    try:
+        return index(action)
+    except TypeError:
+        raise TypeError(f"the action of {agent} must be an integer 0..4, got {action!r}") from None
+
+
+def parallel_env(**settings: Any) -> GridEnv:
+    """A `pettingzoo.ParallelEnv` of one team; the settings are those of `GridEnv`."""
+    return GridEnv(**settings)
+
+
+def env(**settings: Any) -> pettingzoo.AECEnv[str, Any, Any]:
+    """The same environment in PettingZoo's turn-based (AEC) form."""
+    return parallel_to_aec(parallel_env(**settings))

@@ -1,0 +1,153 @@
+"""The problem: robots with starts and goals on one grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mapf_env import _native
+
+Cells = npt.NDArray[np.int32]
+Obstacles = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class Instance:
+    """A multi-agent path finding problem that is known to be well formed.
+
+    Every start and goal is a free cell of the map, no two robots share a start or a goal, and each goal can be reached
+    from its start. A robot may start on its own goal. The arrays are read-only copies.
+
+    Args:
+        grid: (H, W) bool, True is an obstacle. Integers 0 and 1 are accepted.
+        starts: (N, 2) integers, the row and column of each robot.
+        goals: (N, 2) integers, the row and column of each robot's goal.
+
+    Raises:
+        ValueError: If the problem is ill formed; the message names the robot, the cell and the rule.
+        TypeError: If an array has the wrong dtype.
+    """
+
+    grid: Obstacles
+    starts: Cells
+    goals: Cells
+    _components: npt.NDArray[np.int32] = field(init=False)
+
+    def __init__(self, grid: npt.ArrayLike, starts: npt.ArrayLike, goals: npt.ArrayLike) -> None:
+        obstacles = as_obstacles(grid)
+        self._set(obstacles, _native.components(obstacles), starts, goals)
+
+    def _set(
+        self, grid: Obstacles, components: npt.NDArray[np.int32], starts: npt.ArrayLike, goals: npt.ArrayLike
+    ) -> None:
+        start_cells, goal_cells = _as_cells(starts, "starts"), _as_cells(goals, "goals")
+        if start_cells.shape != goal_cells.shape:
+            raise ValueError(f"{len(start_cells)} starts but {len(goal_cells)} goals: give one goal for each robot")
+        _require_free(grid, start_cells, "start")
+        _require_free(grid, goal_cells, "goal")
+        _require_distinct(start_cells, "start")
+        _require_distinct(goal_cells, "goal")
+        cut_off = np.flatnonzero(components[tuple(start_cells.T)] != components[tuple(goal_cells.T)])
+        if len(cut_off):
+            robot = cut_off[0]
+            raise ValueError(
+                f"agent {robot} cannot reach its goal {_cell(goal_cells[robot])} from {_cell(start_cells[robot])}: "
+                "obstacles separate them; move one of the two or open the map"
+            )
+        for name, value in (
+            ("grid", grid),
+            ("starts", start_cells),
+            ("goals", goal_cells),
+            ("_components", components),
+        ):
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    @property
+    def num_agents(self) -> int:
+        """The number of robots N."""
+        return len(self.starts)
+
+    def at(self, positions: npt.ArrayLike) -> Instance:
+        """The same problem seen from another state: robots stand at `positions` (N, 2), goals are unchanged.
+
+        Raises:
+            ValueError: If the positions are not distinct free cells from which the goals can be reached.
+        """
+        seen_from_here = object.__new__(Instance)
+        seen_from_here._set(self.grid, self._components, positions, self.goals)
+        return seen_from_here
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Instance):
+            return NotImplemented
+        return (
+            np.array_equal(self.grid, other.grid)
+            and np.array_equal(self.starts, other.starts)
+            and np.array_equal(self.goals, other.goals)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.grid.shape, self.grid.tobytes(), self.starts.tobytes(), self.goals.tobytes()))
+
+    def __repr__(self) -> str:
+        height, width = self.grid.shape
+        return f"Instance({height}x{width}, {int(self.grid.sum())} obstacles, {self.num_agents} agents)"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Instance, (self.grid, self.starts, self.goals)
+
+
+def as_obstacles(grid: npt.ArrayLike) -> Obstacles:
+    """A contiguous copy of `grid` as (H, W) bool; raises TypeError or ValueError where it is no map."""
+    array = np.asarray(grid)
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(f"grid must have shape (H, W) with at least one cell, got {array.shape}")
+    if array.dtype != np.bool_:
+        if not np.issubdtype(array.dtype, np.integer):
+            raise TypeError(f"grid must be bool (True is an obstacle) or integers 0 and 1, got dtype {array.dtype}")
+        if array.min() < 0 or array.max() > 1:
+            raise ValueError(f"grid must hold 0 (free) and 1 (obstacle) only, got values {array.min()}..{array.max()}")
+    return np.array(array, dtype=np.bool_, order="C")
+
+
+def _as_cells(cells: npt.ArrayLike, name: str) -> Cells:
+    array = np.asarray(cells)
+    if array.ndim != 2 or array.shape[1] != 2 or len(array) == 0:
+        raise ValueError(
+            f"{name} must have shape (N, 2): a row and a column for each of N >= 1 agents, got {array.shape}"
+        )
+    if not np.issubdtype(array.dtype, np.integer):
+        raise TypeError(f"{name} must be integers, got dtype {array.dtype}")
+    limits = np.iinfo(np.int32)
+    return np.array(np.clip(array, limits.min, limits.max), dtype=np.int32, order="C")
+
+
+def _require_free(grid: Obstacles, cells: Cells, name: str) -> None:
+    height, width = grid.shape
+    outside = np.flatnonzero(((cells < 0) | (cells >= (height, width))).any(axis=1))
+    if len(outside):
+        robot = outside[0]
+        raise ValueError(f"the {name} {_cell(cells[robot])} of agent {robot} lies outside the {height}x{width} map")
+    blocked = np.flatnonzero(grid[tuple(cells.T)])
+    if len(blocked):
+        robot = blocked[0]
+        raise ValueError(f"the {name} {_cell(cells[robot])} of agent {robot} lies on an obstacle; choose a free cell")
+
+
+def _require_distinct(cells: Cells, name: str) -> None:
+    flat = cells[:, 0].astype(np.int64) << 32 | cells[:, 1]
+    order = np.argsort(flat, kind="stable")
+    twins = np.flatnonzero(flat[order[1:]] == flat[order[:-1]])
+    if len(twins):
+        first, second = order[twins[0]], order[twins[0] + 1]
+        raise ValueError(
+            f"agents {first} and {second} share the {name} {_cell(cells[first])}; every agent needs a {name} of its own"
+        )
+
+
+def _cell(cell: Cells) -> str:
+    return f"({cell[0]}, {cell[1]})"

@@ -1,0 +1,39 @@
+// New goals for robots that have arrived, where the task goes on for ever.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "mapf_env/native/grid.hpp"
+#include "mapf_env/native/random.hpp"
+
+namespace mapf {
+
+// What draws the goal that a robot gets at its arrival number `arrival` of an episode.
+inline Random goal_random(std::uint64_t seed, int robot, int arrival) {
+    return Random(mix(mix(seed_for(Use::goals, seed), robot), arrival));
+}
+
+// A goal for a robot: uniform over the free cells that it can reach, that are no robot's goal and where it does not
+// stand; if there is none, it keeps its goal. `regions` (layout.size()) numbers the connected regions, obstacles are -1;
+// `taken` (layout.size()) has a 1 at each goal and is kept so. Returns whether the goal has changed.
+inline bool draw_goal(const Layout& layout, const std::int32_t* regions, const std::int32_t* position, Random random,
+                      std::uint8_t* taken, std::int32_t* goal) {
+    constexpr int patience = 64;  // draws; where free cells are rarer than that, the next one is taken
+    const int here = layout.cell(position[0], position[1]), area = layout.height * layout.width;
+    const auto fits = [&](int place) {
+        const int cell = layout.cell(place / layout.width, place % layout.width);
+        return regions[cell] == regions[here] && !taken[cell] && cell != here;
+    };
+    int place = random.below(area), draws = 1;
+    for (; draws < patience && !fits(place); ++draws) place = random.below(area);
+    for (int tries = 0; tries < area && !fits(place); ++tries) place = (place + 1) % area;
+    if (!fits(place)) return false;
+    taken[layout.cell(goal[0], goal[1])] = 0;
+    goal[0] = place / layout.width;
+    goal[1] = place % layout.width;
+    taken[layout.cell(goal[0], goal[1])] = 1;
+    return true;
+}
+
+}  // namespace mapf

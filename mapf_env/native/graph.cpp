@@ -1,0 +1,85 @@
+#include "mapf_env/native/graph.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "mapf_env/native/random.hpp"
+
+// The same loop for processors with wider registers, chosen when the module is loaded.
+#if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(__clang__)
+#define MAPF_WIDE __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define MAPF_WIDE
+#endif
+
+namespace mapf {
+
+namespace {
+
+MAPF_WIDE void write_rows(const float* rows, const float* cols, int num_agents, float limit, bool binary, int stride,
+                          float* out) {
+    for (int i = 0; i < num_agents; ++i, out += stride) {
+        const float row = rows[i], col = cols[i];
+        if (binary)
+            for (int j = 0; j < num_agents; ++j) {
+                const float down = row - rows[j], right = col - cols[j];
+                out[j] = down * down + right * right < limit ? 1.0f : 0.0f;
+            }
+        else
+            for (int j = 0; j < num_agents; ++j) {
+                const float down = row - rows[j], right = col - cols[j], square = down * down + right * right;
+                out[j] = square < limit ? 1.0f / std::sqrt(square) : 0.0f;
+            }
+        out[i] = 0.0f;
+    }
+}
+
+}  // namespace
+
+void communication_graph(const std::int32_t* positions, int num_agents, double radius, Weights weights, int stride,
+                         std::vector<float>& rows, std::vector<float>& cols, float* out) {
+    rows.resize(num_agents);
+    cols.resize(num_agents);
+    for (int i = 0; i < num_agents; ++i) {
+        rows[i] = static_cast<float>(positions[2 * i]);
+        cols[i] = static_cast<float>(positions[2 * i + 1]);
+    }
+    // Squared distances are whole numbers, exact in float up to maps of 2896 x 2896 cells; `limit` is the least of them
+    // that is too far.
+    double nearest = std::floor(radius * radius);
+    if (std::sqrt(nearest) < radius) ++nearest;
+    write_rows(rows.data(), cols.data(), num_agents, static_cast<float>(nearest), weights == Weights::binary, stride,
+               out);
+}
+
+void lose_messages(int num_agents, double loss, std::uint64_t key, int stride, float* weights) {
+    for (int i = 0; i < num_agents; ++i, weights += stride)
+        for (int j = 0; j < num_agents; ++j)
+            if (weights[j] != 0.0f && uniform(mix(mix(key, i), j)) < loss) weights[j] = 0.0f;
+}
+
+double connecting_radius(const std::int32_t* positions, int num_agents, double radius) {
+    // The longest edge of the shortest spanning tree (Prim 1957) is what the radius has to exceed.
+    std::vector<double> gap(num_agents, std::numeric_limits<double>::infinity());
+    std::vector<bool> joined(num_agents, false);
+    double longest = 0.0;
+    int newest = 0;
+    for (int size = 1; size < num_agents; ++size) {
+        joined[newest] = true;
+        int closest = -1;
+        for (int i = 0; i < num_agents; ++i) {
+            if (joined[i]) continue;
+            const double down = positions[2 * i] - positions[2 * newest];
+            const double right = positions[2 * i + 1] - positions[2 * newest + 1];
+            gap[i] = std::min(gap[i], down * down + right * right);
+            if (closest < 0 || gap[i] < gap[closest]) closest = i;
+        }
+        longest = std::max(longest, gap[closest]);
+        newest = closest;
+    }
+    while (num_agents > 1 && !(std::sqrt(longest) < radius)) radius *= 1.1;
+    return radius;
+}
+
+}  // namespace mapf

@@ -1,0 +1,25 @@
+// Who hears whom.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+namespace mapf {
+
+enum class Weights : int {
+    binary,    // 1
+    distance,  // 1 / distance
+};
+
+// Writes the weights (num_agents, num_agents), `stride` floats apart: of two different robots closer than `radius`, else
+// 0. `rows` and `cols` are scratch.
+void communication_graph(const std::int32_t* positions, int num_agents, double radius, Weights weights, int stride,
+                         std::vector<float>& rows, std::vector<float>& cols, float* out);
+
+// Sets each weight (num_agents, num_agents), `stride` apart, to 0 with probability `loss`, drawn by `key`.
+void lose_messages(int num_agents, double loss, std::uint64_t key, int stride, float* weights);
+
+// The least radius * 1.1^k, k = 0, 1, ..., at which all robots are connected; radius > 0.
+double connecting_radius(const std::int32_t* positions, int num_agents, double radius);
+
+}  // namespace mapf

@@ -1,0 +1,114 @@
+// The grid as every solver and rule sees it: cells in one row-major array with a border of obstacles, so that a
+// neighbour is an addition and needs no bounds check.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <limits>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+namespace mapf {
+
+inline constexpr int num_actions = 5;
+inline constexpr int idle = 4;
+
+// The moves in the paper's order: up, left, down, right, idle.
+inline constexpr std::array<int, num_actions> row_step{-1, 0, 1, 0, 0};
+inline constexpr std::array<int, num_actions> col_step{0, -1, 0, 1, 0};
+
+using Distance = std::uint16_t;
+inline constexpr Distance unreachable = std::numeric_limits<Distance>::max();
+
+// Geometry of a height x width map inside a border of `pad` obstacle cells.
+struct Layout {
+    int height, width, pad;
+
+    int stride() const { return width + 2 * pad; }
+    int rows() const { return height + 2 * pad; }
+    int size() const { return rows() * stride(); }
+    int cell(int row, int col) const { return (row + pad) * stride() + col + pad; }
+    int row(int cell) const { return cell / stride() - pad; }
+    int col(int cell) const { return cell % stride() - pad; }
+    bool contains(int row, int col) const { return row >= 0 && row < height && col >= 0 && col < width; }
+    std::array<int, num_actions> steps() const { return {-stride(), -1, stride(), 1, 0}; }
+};
+
+// Obstacles of one map inside a border, one cell wide or as wide as a kernel needs.
+struct Grid {
+    Layout layout;
+    std::vector<std::uint8_t> blocked;
+
+    // Takes over a map that has its border.
+    Grid(const Layout& layout, std::vector<std::uint8_t> blocked) : layout(layout), blocked(std::move(blocked)) {}
+
+    // `obstacles` holds height * width values, row-major; non-zero is an obstacle.
+    Grid(const std::uint8_t* obstacles, int height, int width) : layout{height, width, 1} {
+        blocked.assign(static_cast<std::size_t>(layout.size()), 1);
+        for (int row = 0; row < height; ++row)
+            for (int col = 0; col < width; ++col)
+                blocked[layout.cell(row, col)] = obstacles[static_cast<std::size_t>(row) * width + col] != 0;
+    }
+};
+
+// Steps from every cell to `goal` by breadth-first search, `unreachable` where there is no way. `queue` is scratch.
+// Throws std::overflow_error if a distance does not fit.
+inline void distances_to(const Grid& grid, int goal, std::vector<Distance>& distance, std::vector<int>& queue) {
+    const std::size_t size = grid.blocked.size();
+    distance.resize(size);
+    queue.resize(size);
+    // Obstacles count as visited until the end, so that one comparison without a branch tells what is new.
+    for (std::size_t cell = 0; cell < size; ++cell) distance[cell] = grid.blocked[cell] ? 0 : unreachable;
+    const auto steps = grid.layout.steps();
+    Distance* const found = distance.data();
+    int* const open = queue.data();
+    std::size_t head = 0, tail = 0;
+    found[goal] = 0;
+    open[tail++] = goal;
+    while (head < tail) {
+        const int cell = open[head++];
+        const auto next = static_cast<Distance>(found[cell] + 1);
+        if (next == unreachable) throw std::overflow_error("a shortest path on this map is longer than 65533 steps");
+        for (int action = 0; action < idle; ++action) {
+            const int neighbour = cell + steps[action];
+            const bool is_new = found[neighbour] == unreachable;
+            found[neighbour] = is_new ? next : found[neighbour];
+            open[tail] = neighbour;
+            tail += is_new;
+        }
+    }
+    for (std::size_t cell = 0; cell < size; ++cell) distance[cell] = grid.blocked[cell] ? unreachable : distance[cell];
+}
+
+// Numbers the connected free regions 0, 1, ... in `labels` (height * width, row-major); obstacles are -1.
+inline void label_components(const Grid& grid, std::int32_t* labels) {
+    const auto& layout = grid.layout;
+    const auto steps = layout.steps();
+    std::vector<std::int32_t> label(grid.blocked.size(), -1);
+    std::vector<int> stack;
+    std::int32_t regions = 0;
+    for (int row = 0; row < layout.height; ++row)
+        for (int col = 0; col < layout.width; ++col) {
+            const int cell = layout.cell(row, col);
+            if (!grid.blocked[cell] && label[cell] < 0) {
+                label[cell] = regions;
+                stack.push_back(cell);
+                while (!stack.empty()) {
+                    const int here = stack.back();
+                    stack.pop_back();
+                    for (int action = 0; action < idle; ++action) {
+                        const int neighbour = here + steps[action];
+                        if (grid.blocked[neighbour] || label[neighbour] >= 0) continue;
+                        label[neighbour] = regions;
+                        stack.push_back(neighbour);
+                    }
+                }
+                ++regions;
+            }
+            *labels++ = label[cell];
+        }
+}
+
+}  // namespace mapf

@@ -1,0 +1,341 @@
+#include "mapf_env/native/stepper.hpp"
+
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+#ifndef _WIN32
+#include <unistd.h>
+#endif
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "mapf_env/native/arrays.hpp"
+#include "mapf_env/native/pool.hpp"
+#include "mapf_env/native/team_step.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace mapf {
+
+namespace {
+
+[[noreturn]] void fail(const std::string& message) { throw nb::value_error(message.c_str()); }
+
+std::string shown(std::initializer_list<std::size_t> shape) {
+    std::string text;
+    for (const auto extent : shape) text += (text.empty() ? "(" : ", ") + std::to_string(extent);
+    return text + ")";
+}
+
+int process() {
+#ifdef _WIN32
+    return 0;
+#else
+    return static_cast<int>(getpid());
+#endif
+}
+
+// row[name] = value.
+void set(PyObject* row, PyObject* name, PyObject* value) {
+    if (value == nullptr || PyDict_SetItem(row, name, value) != 0) throw nb::python_error();
+}
+
+// A new reference to sequence[i].
+nb::object item(PyObject* sequence, Py_ssize_t i) {
+    nb::object value = nb::steal(PySequence_GetItem(sequence, i));
+    if (!value.is_valid()) throw nb::python_error();
+    return value;
+}
+
+// {agent: {name: column[i], ...}, ...} for the i-th agent, or {agent: column[i], ...} without names.
+nb::dict rows_by_agent(nb::list agents, nb::tuple names, nb::tuple columns) {
+    const std::size_t width = names.size();
+    if (columns.size() != std::max<std::size_t>(width, 1)) fail("give one column for each name");
+    nb::dict rows;
+    for (Py_ssize_t i = 0; i < PyList_Size(agents.ptr()); ++i) {
+        PyObject* agent = PyList_GetItem(agents.ptr(), i);
+        if (width == 0) {
+            set(rows.ptr(), agent, item(PyTuple_GetItem(columns.ptr(), 0), i).ptr());
+            continue;
+        }
+        const nb::dict row;
+        for (std::size_t k = 0; k < width; ++k)
+            set(row.ptr(), PyTuple_GetItem(names.ptr(), k), item(PyTuple_GetItem(columns.ptr(), k), i).ptr());
+        set(rows.ptr(), agent, row.ptr());
+    }
+    return rows;
+}
+
+// Reads actions[agent] of each agent, in order; false if the agents are not the same or an action is no whole number.
+bool read_actions(const nb::dict& actions, const nb::list& agents, std::vector<std::int64_t>& wanted) {
+    const std::size_t count = wanted.size();
+    if (actions.size() != count || agents.size() != count) return false;
+    for (std::size_t i = 0; i < count; ++i) {
+        PyObject* action = PyDict_GetItem(actions.ptr(), PyList_GetItem(agents.ptr(), static_cast<Py_ssize_t>(i)));
+        if (action == nullptr) return false;
+        const nb::object whole = PyLong_Check(action) ? nb::borrow(action) : nb::steal(PyNumber_Index(action));
+        wanted[i] = whole.is_valid() ? PyLong_AsLongLong(whole.ptr()) : -1;
+        if (wanted[i] == -1 && PyErr_Occurred()) {
+            PyErr_Clear();
+            return false;
+        }
+    }
+    return true;
+}
+
+// The rules bound to the arrays of B teams, which Python owns and this changes in place.
+template <class T>
+class Stepper {
+public:
+    Stepper(nb::object state, int pad, bool pibt, bool lifelong, int max_cycles, int weights, double message_loss,
+            const std::vector<int>& extras, const std::vector<float>& rewards, int threads)
+        : state_(std::move(state)), threads_(threads) {
+        const auto positions = array<std::int32_t, 3>("positions");
+        const auto obstacles = array<T, 3>("obstacles");
+        const std::size_t B = positions.shape(0), N = positions.shape(1);
+        const int rows = static_cast<int>(obstacles.shape(1)), cols = static_cast<int>(obstacles.shape(2));
+        teams_.layout = {rows - 2 * pad, cols - 2 * pad, pad};
+        teams_.num_envs = B;
+        teams_.num_agents = N;
+        const std::size_t size = teams_.layout.size();
+        if (pad < 1 || rows <= 2 * pad || cols <= 2 * pad || threads < 1 || rewards.size() != 6)
+            fail("the arrays of the teams do not fit together");
+        teams_.obstacles = own<T>("obstacles", {B, rows * 1u, cols * 1u});
+        teams_.positions = own<std::int32_t>("positions", {B, N, 2});
+        teams_.goals = own<std::int32_t>("goals", {B, N, 2});
+        teams_.previous = own<std::int32_t>("previous", {B, N, 2});
+        teams_.team_sizes = own<std::int32_t>("team_sizes", {B});
+        teams_.seeds = own<std::uint64_t>("seeds", {B});
+        teams_.comm_radius = own<double>("comm_radius", {B});
+        teams_.regions = own<std::int32_t>("regions", {B, size}, !lifelong);
+        teams_.under_way = own<std::int32_t>("under_way", {B, N});
+        teams_.arrivals = own<std::int32_t>("arrivals", {B, N});
+        teams_.times = own<std::int64_t>("times", {B});
+        teams_.ended = own<bool>("ended", {B});
+        teams_.rewards = own<float>("rewards", {B, N});
+        teams_.terminated = own<bool>("terminated", {B});
+        teams_.truncated = own<bool>("truncated", {B});
+        teams_.replaced = own<bool>("replaced", {B, N});
+        teams_.arrived = own<bool>("arrived", {B, N});
+        teams_.on_goal = own<bool>("on_goal", {B, N});
+        teams_.action_mask = own<std::int8_t>("action_mask", {B, N, num_actions});
+        options_ = {pad, pibt, lifelong, max_cycles, static_cast<Weights>(weights), message_loss, {},
+                    {rewards[0], rewards[1], rewards[2], rewards[3], rewards[4], rewards[5]}};
+        for (const int extra : extras) options_.extras.push_back(static_cast<Channel>(extra));
+        const bool distances = options_.rewards.closer != 0.0f ||
+                               std::count(extras.begin(), extras.end(), static_cast<int>(Channel::cost_to_go)) > 0;
+        teams_.distances = own<Distance>("distances", {B, N, size}, !distances);
+        for (int part = 0; part < threads; ++part) scratch_.emplace_back(teams_.layout, static_cast<int>(N));
+    }
+
+    void step(In<std::int64_t, 2> actions, InOut<T, 5> fov, InOut<float, 3> graph, bool skip_ended) {
+        const std::size_t B = teams_.num_envs, N = teams_.num_agents;
+        if (actions.shape(0) != B || actions.shape(1) != N)
+            fail("actions must have shape " + shown({B, N}) + ", got " + shown({actions.shape(0), actions.shape(1)}));
+        require_actions(actions.data());
+        run({actions.data(), nullptr}, fov, graph, skip_ended);
+    }
+
+    void step_by_values(In<float, 3> values, InOut<T, 5> fov, InOut<float, 3> graph, bool skip_ended) {
+        const std::size_t B = teams_.num_envs, N = teams_.num_agents;
+        if (!options_.pibt)
+            fail("actions must have shape " + shown({B, N}) + "; values of all five actions need shield=\"pibt\"");
+        if (values.shape(0) != B || values.shape(1) != N || values.shape(2) != num_actions)
+            fail("values of actions must have shape " + shown({B, N, num_actions}) + ", got " +
+                 shown({values.shape(0), values.shape(1), values.shape(2)}));
+        for (std::size_t i = 0; i < values.size(); ++i)
+            if (std::isnan(values.data()[i]))
+                fail("a value of agent " + std::to_string(i / num_actions % N) + " in environment " +
+                     std::to_string(i / num_actions / N) + " is not a number");
+        run({nullptr, values.data()}, fov, graph, skip_ended);
+    }
+
+    // Writes what the teams perceive; with `chosen` (B) those teams only.
+    void observe(InOut<T, 5> fov, InOut<float, 3> graph, std::optional<In<bool, 1>> chosen) {
+        require_room(fov, graph);
+        if (chosen && chosen->shape(0) != teams_.num_envs) fail("give one choice for each environment");
+        const bool* wanted = chosen ? chosen->data() : nullptr;
+        T* views = fov.data();
+        float* weights = graph.data();
+        nb::gil_scoped_release release;
+        for_each_team([&](std::size_t b, TeamScratch<T>& scratch) {
+            if (wanted == nullptr || wanted[b]) perceive_into(b, scratch, views, weights);
+        });
+    }
+
+    // What the last step brought to the first team, by agent, in dictionaries that are filled in place.
+    // Returns whether the episode has ended.
+    bool outcome_by_agent(nb::list agents, nb::dict rewards, nb::dict terminated, nb::dict truncated, nb::dict infos) {
+        static constexpr std::array names{"replaced", "on_goal", "arrived"};
+        if (agents.size() != teams_.num_agents) fail("give one name for each agent");
+        const std::array flags{teams_.replaced, teams_.on_goal, teams_.arrived};
+        std::array<nb::object, 3> keys;
+        for (std::size_t k = 0; k < keys.size(); ++k) keys[k] = nb::steal(PyUnicode_InternFromString(names[k]));
+        const std::size_t num_flags = options_.lifelong ? 3 : 2;
+        PyObject* const ended[2] = {teams_.terminated[0] ? Py_True : Py_False, teams_.truncated[0] ? Py_True : Py_False};
+        for (std::size_t i = 0; i < teams_.num_agents; ++i) {
+            PyObject* agent = PyList_GetItem(agents.ptr(), static_cast<Py_ssize_t>(i));
+            set(rewards.ptr(), agent, nb::steal(PyFloat_FromDouble(teams_.rewards[i])).ptr());
+            set(terminated.ptr(), agent, ended[0]);
+            set(truncated.ptr(), agent, ended[1]);
+            PyObject* info = PyDict_GetItem(infos.ptr(), agent);
+            if (info == nullptr || !PyDict_Check(info)) fail("infos must have a dictionary for each agent");
+            for (std::size_t k = 0; k < num_flags; ++k)
+                set(info, keys[k].ptr(), flags[k][i] ? Py_True : Py_False);
+        }
+        return teams_.ended[0];
+    }
+
+    // `step`, the action masks and `outcome_by_agent` of a batch of one; None, and nothing done, if the actions cannot
+    // be read.
+    std::optional<bool> step_agents(nb::dict actions, nb::list agents, InOut<T, 5> fov, InOut<float, 3> graph,
+                                    InOut<std::int8_t, 2> masks, nb::dict rewards, nb::dict terminated,
+                                    nb::dict truncated, nb::dict infos) {
+        const std::size_t N = teams_.num_agents;
+        wanted_.resize(N);
+        if (teams_.num_envs != 1 || !read_actions(actions, agents, wanted_)) return std::nullopt;
+        if (masks.shape(0) != N || masks.shape(1) != num_actions) fail("the memory for masks must have shape (N, 5)");
+        require_actions(wanted_.data());
+        run({wanted_.data(), nullptr}, fov, graph, false);
+        write_action_mask(teams_, 0);
+        if (masks.data() != teams_.action_mask) std::copy_n(teams_.action_mask, N * num_actions, masks.data());
+        return outcome_by_agent(agents, rewards, terminated, truncated, infos);
+    }
+
+    void write_action_masks() {
+        for (std::size_t b = 0; b < teams_.num_envs; ++b) write_action_mask(teams_, b);
+    }
+
+private:
+    template <class Value, int dims>
+    InOut<Value, dims> array(const char* name) {
+        return nb::cast<InOut<Value, dims>>(state_.attr(name), false);
+    }
+
+    // The memory of an array of the state, whose shape is checked; nullptr if it may be missing and is empty.
+    template <class Value>
+    Value* own(const char* name, std::initializer_list<std::size_t> shape, bool may_miss = false) {
+        auto held = nb::cast<nb::ndarray<Value, nb::c_contig, nb::device::cpu>>(state_.attr(name), false);
+        if (may_miss && held.size() == 0) return nullptr;
+        bool fits = held.ndim() == shape.size();
+        for (std::size_t axis = 0; fits && axis < shape.size(); ++axis)
+            fits = held.shape(axis) == shape.begin()[axis];
+        if (!fits) fail(std::string(name) + " must have shape " + shown(shape));
+        return held.data();
+    }
+
+    void require_room(const InOut<T, 5>& fov, const InOut<float, 3>& graph) const {
+        const std::size_t B = teams_.num_envs, N = teams_.num_agents, side = 2 * options_.fov_radius + 3;
+        const std::size_t planes = num_channels + options_.extras.size();
+        if (fov.shape(0) != B || fov.shape(1) != N || fov.shape(2) != planes || fov.shape(3) != side ||
+            fov.shape(4) != side)
+            fail("the memory for views must have shape " + shown({B, N, planes, side, side}));
+        if (graph.shape(0) != B || graph.shape(1) != N || graph.shape(2) != N)
+            fail("the memory for graphs must have shape " + shown({B, N, N}));
+    }
+
+    void require_actions(const std::int64_t* actions) const {  // of all robots, those that are not there too
+        const std::size_t robots = teams_.num_envs * teams_.num_agents;
+        const auto is_none = [](std::int64_t action) { return static_cast<std::uint64_t>(action) >= num_actions; };
+        bool any = false;
+        for (std::size_t i = 0; i < robots; ++i) any |= is_none(actions[i]);
+        if (!any) return;
+        const std::size_t i = std::find_if(actions, actions + robots, is_none) - actions;
+        fail("action " + std::to_string(actions[i]) + " of agent " + std::to_string(i % teams_.num_agents) +
+             " in environment " + std::to_string(i / teams_.num_agents) +
+             " is none of 0..4 (up, left, down, right, idle)");
+    }
+
+    void perceive_into(std::size_t b, TeamScratch<T>& scratch, T* fov, float* graph) {
+        const std::size_t N = teams_.num_agents, side = 2 * options_.fov_radius + 3;
+        const std::size_t team = N * (num_channels + options_.extras.size()) * side * side;
+        perceive(teams_, options_, b, scratch, fov + b * team, graph + b * N * N);
+    }
+
+    template <class Job>
+    void for_each_team(Job&& job) {
+        const std::size_t B = teams_.num_envs, parts = std::min<std::size_t>(threads_, B);
+        if (parts == 1) {
+            for (std::size_t b = 0; b < B; ++b) job(b, scratch_[0]);
+            return;
+        }
+        if (pool_ && process_ != process()) (void)pool_.release();  // threads do not survive a fork
+        if (!pool_) pool_ = std::make_unique<Pool>(static_cast<int>(parts));
+        process_ = process();
+        pool_->run([&](int part) {
+            for (std::size_t b = B * part / parts; b < B * (part + 1) / parts; ++b) job(b, scratch_[part]);
+        });
+    }
+
+    void run(Wishes wishes, const InOut<T, 5>& fov, const InOut<float, 3>& graph, bool skip_ended) {
+        require_room(fov, graph);
+        const std::size_t B = teams_.num_envs, N = teams_.num_agents;
+        const auto ended = std::count(teams_.ended, teams_.ended + B, true);
+        if (ended > 0 && !skip_ended)
+            throw std::runtime_error(
+                std::to_string(ended) + " of " + std::to_string(B) + " environments (the first is " +
+                std::to_string(std::find(teams_.ended, teams_.ended + B, true) - teams_.ended) +
+                ") have ended or were never reset: call reset(mask=...) before step");
+        T* views = fov.data();
+        float* weights = graph.data();
+        nb::gil_scoped_release release;
+        for_each_team([&](std::size_t b, TeamScratch<T>& scratch) {
+            if (teams_.ended[b]) {  // its robots do nothing and earn nothing
+                std::fill_n(teams_.rewards + b * N, N, 0.0f);
+                std::fill_n(teams_.replaced + b * N, N, false);
+                std::fill_n(teams_.arrived + b * N, N, false);
+                teams_.terminated[b] = teams_.truncated[b] = false;
+                return;
+            }
+            step_team(teams_, options_, b, wishes, scratch);
+            perceive_into(b, scratch, views, weights);
+        });
+    }
+
+    nb::object state_;
+    Teams<T> teams_{};
+    Options options_;
+    std::vector<TeamScratch<T>> scratch_;
+    std::vector<std::int64_t> wanted_;
+    int threads_, process_ = 0;
+    std::unique_ptr<Pool> pool_;
+};
+
+template <class T>
+void define(nb::module_& m, const char* name) {
+    nb::class_<Stepper<T>>(m, name, "The rules of motion and perception, bound to the arrays of B teams.")
+        .def(nb::init<nb::object, int, bool, bool, int, int, double, std::vector<int>, std::vector<float>, int>(),
+             "state"_a, "pad"_a, "pibt"_a, "lifelong"_a, "max_cycles"_a, "weights"_a, "message_loss"_a, "extras"_a,
+             "rewards"_a, "threads"_a)
+        .def("step", &Stepper<T>::step, "actions"_a, "fov"_a.noconvert(), "graph"_a.noconvert(), "skip_ended"_a,
+             "Execute joint actions (B, N) under the shield and write what the robots perceive.")
+        .def("step_by_values", &Stepper<T>::step_by_values, "values"_a, "fov"_a.noconvert(), "graph"_a.noconvert(),
+             "skip_ended"_a, "Execute by values of all five actions (B, N, 5), under shield \"pibt\" only.")
+        .def("observe", &Stepper<T>::observe, "fov"_a.noconvert(), "graph"_a.noconvert(), "chosen"_a.none(),
+             "Write what the robots perceive, of all teams or of the chosen ones (B,).")
+        .def("outcome_by_agent", &Stepper<T>::outcome_by_agent, "agents"_a, "rewards"_a, "terminated"_a, "truncated"_a,
+             "infos"_a, "Fill dictionaries with what the last step brought to the agents of the first team.")
+        .def("step_agents", &Stepper<T>::step_agents, "actions"_a, "agents"_a, "fov"_a.noconvert(),
+             "graph"_a.noconvert(), "masks"_a.noconvert(), "rewards"_a, "terminated"_a, "truncated"_a, "infos"_a,
+             "Step the only team by actions by agent and fill the dictionaries; whether the episode has ended, or None "
+             "if the actions cannot be read.")
+        .def("write_action_masks", &Stepper<T>::write_action_masks, "Bring the state's action_mask (B, N, 5) up to date.");
+}
+
+}  // namespace
+
+void define_stepper(nb::module_& m) {
+    define<float>(m, "StepperFloat32");
+    define<std::uint8_t>(m, "StepperUint8");
+    m.def("rows_by_agent", &rows_by_agent, "agents"_a, "names"_a, "columns"_a,
+          "{agent: {name: column[i]}} as new dictionaries; without names {agent: column[i]}.");
+}
+
+}  // namespace mapf

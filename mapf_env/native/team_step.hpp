@@ -1,0 +1,243 @@
+// One joint step of a team, from wanted actions to new observations, in one pass while its data are in the cache.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+#include "mapf_env/native/goals.hpp"
+#include "mapf_env/native/graph.hpp"
+#include "mapf_env/native/grid.hpp"
+#include "mapf_env/native/observe.hpp"
+#include "mapf_env/native/pibt_shield.hpp"
+#include "mapf_env/native/random.hpp"
+#include "mapf_env/native/shield.hpp"
+
+namespace mapf {
+
+// What a robot earns in a step; the parts add up.
+struct Rewards {
+    float on_goal, off_goal, arrival, replaced, solved, closer;
+};
+
+struct Options {
+    int fov_radius = 0;
+    bool pibt = false, lifelong = false;
+    int max_cycles = 0;
+    Weights weights = Weights::binary;
+    double message_loss = 0.0;
+    std::vector<Channel> extras;
+    Rewards rewards{};
+};
+
+// The arrays of B teams of at most N robots, environments first. Of team b the first team_sizes[b] robots are there.
+template <class T>
+struct Teams {
+    Layout layout;
+    std::size_t num_envs, num_agents;
+    const T* obstacles;             // (B, layout.size())
+    const std::int32_t* team_sizes; // (B)
+    const std::uint64_t* seeds;     // (B) of the episodes
+    const double* comm_radius;      // (B)
+    const std::int32_t* regions;    // (B, layout.size()), only if goals change
+    std::int32_t *positions, *goals, *previous;  // (B, N, 2)
+    std::int32_t* under_way;        // (B, N) steps since the robot was on its goal
+    std::int32_t* arrivals;         // (B, N) how often it has arrived
+    Distance* distances;            // (B, N, layout.size()) to the goals, only where they are asked for
+    std::int64_t* times;            // (B)
+    bool* ended;                    // (B)
+    // What the last step brought.
+    float* rewards;                 // (B, N)
+    bool *terminated, *truncated;   // (B)
+    bool *replaced, *arrived, *on_goal;  // (B, N)
+    std::int8_t* action_mask;       // (B, N, 5)
+};
+
+// Memory for the steps of one thread.
+template <class T>
+struct TeamScratch {
+    ShieldScratch shield;
+    PibtScratch<T> pibt;
+    std::vector<T> marks;
+    std::vector<std::uint8_t> taken;
+    std::vector<std::int8_t> executed;
+    std::vector<float> rows, cols;
+    std::vector<Distance> distance;
+    std::vector<int> queue;
+
+    TeamScratch(const Layout& layout, int num_agents)
+        : shield(layout, num_agents), pibt(layout, num_agents), marks(layout.size(), T{0}), taken(layout.size(), 0),
+          executed(num_agents) {}
+};
+
+template <class T>
+Grid grid_of(const Layout& layout, const T* obstacles) {
+    std::vector<std::uint8_t> blocked(layout.size());
+    std::transform(obstacles, obstacles + layout.size(), blocked.begin(), [](T cell) { return cell != T{0}; });
+    return {layout, std::move(blocked)};
+}
+
+// Writes what team b perceives: fov (N, planes, side, side) and graph (N, N); zeros for robots that are not there.
+template <class T>
+void perceive(const Teams<T>& teams, const Options& options, std::size_t b, TeamScratch<T>& scratch, T* fov,
+                        float* graph) {
+    const auto& layout = teams.layout;
+    const std::size_t N = teams.num_agents;
+    const int n = teams.team_sizes[b], radius = options.fov_radius, side = 2 * radius + 3;
+    const int planes = num_channels + static_cast<int>(options.extras.size());
+    const std::size_t view = static_cast<std::size_t>(planes) * side * side;
+    const std::int32_t* positions = teams.positions + b * N * 2;
+    const std::int32_t* goals = teams.goals + b * N * 2;
+    observe(layout, teams.obstacles + b * layout.size(), positions, goals, n, radius, planes, scratch.marks.data(), fov);
+    T* plane = fov + num_channels * side * side;
+    for (const Channel channel : options.extras) {
+        switch (channel) {
+            case Channel::cost_to_go:
+                observe_cost_to_go(layout, teams.distances + b * N * layout.size(), positions, n, radius, planes, plane);
+                break;
+            case Channel::other_goals:
+                observe_other_goals(layout, positions, goals, n, radius, planes, scratch.marks.data(), plane);
+                break;
+            case Channel::previous_positions:
+                observe_previous_positions(layout, positions, teams.previous + b * N * 2, n, radius, planes,
+                                           scratch.marks.data(), plane);
+                break;
+        }
+        plane += side * side;
+    }
+    const int stride = static_cast<int>(N);
+    communication_graph(positions, n, teams.comm_radius[b], options.weights, stride, scratch.rows, scratch.cols, graph);
+    if (options.message_loss > 0.0)
+        lose_messages(n, options.message_loss, mix(seed_for(Use::messages, teams.seeds[b]), teams.times[b]), stride,
+                      graph);
+    if (n < stride) {
+        std::fill_n(fov + n * view, (N - n) * view, T{0});
+        for (int i = 0; i < n; ++i) std::fill_n(graph + i * N + n, N - n, 0.0f);
+        std::fill_n(graph + n * N, (N - n) * N, 0.0f);
+    }
+}
+
+// Writes which actions neither leave the map nor enter an obstacle; a robot that is not there can only idle.
+template <class T>
+void write_action_mask(const Teams<T>& teams, std::size_t b) {
+    const auto& layout = teams.layout;
+    const auto steps = layout.steps();
+    const T* map = teams.obstacles + b * layout.size();
+    for (std::size_t i = b * teams.num_agents; i < (b + 1) * teams.num_agents; ++i) {
+        if (i - b * teams.num_agents >= static_cast<std::size_t>(teams.team_sizes[b])) {
+            for (int action = 0; action < num_actions; ++action)
+                teams.action_mask[i * num_actions + action] = action == idle;
+            continue;
+        }
+        const int cell = layout.cell(teams.positions[2 * i], teams.positions[2 * i + 1]);
+        for (int action = 0; action < num_actions; ++action)
+            teams.action_mask[i * num_actions + action] = map[cell + steps[action]] == T{0};
+    }
+}
+
+// A new goal for each robot of team b that has arrived in this step.
+template <class T>
+void give_goals(const Teams<T>& teams, std::size_t b, TeamScratch<T>& scratch) {
+    const auto& layout = teams.layout;
+    const std::size_t first = b * teams.num_agents;
+    const int n = teams.team_sizes[b];
+    const bool* arrived = teams.arrived + first;
+    if (std::none_of(arrived, arrived + n, [](bool robot) { return robot; })) return;
+    std::int32_t* goals = teams.goals + 2 * first;
+    mark(layout, goals, n, std::uint8_t{1}, scratch.taken.data());
+    for (int i = 0; i < n; ++i) {
+        if (!arrived[i]) continue;
+        const bool is_new = draw_goal(layout, teams.regions + b * layout.size(), teams.positions + 2 * (first + i),
+                                      goal_random(teams.seeds[b], i, teams.arrivals[first + i]), scratch.taken.data(),
+                                      goals + 2 * i);
+        if (!is_new) continue;
+        teams.on_goal[first + i] = false;
+        if (teams.distances == nullptr) continue;
+        distances_to(grid_of(layout, teams.obstacles + b * layout.size()), layout.cell(goals[2 * i], goals[2 * i + 1]),
+                     scratch.distance, scratch.queue);
+        std::copy(scratch.distance.begin(), scratch.distance.end(), teams.distances + (first + i) * layout.size());
+    }
+    mark(layout, goals, n, std::uint8_t{0}, scratch.taken.data());
+}
+
+// What team b wants: an action of each robot (N), or values of all five (N, 5).
+struct Wishes {
+    const std::int64_t* actions;
+    const float* values;
+};
+
+// Shields, moves and rewards team b; the wishes were checked before.
+template <class T>
+void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wishes wishes, TeamScratch<T>& scratch) {
+    const auto& layout = teams.layout;
+    const std::size_t N = teams.num_agents, first = b * N;
+    const int n = teams.team_sizes[b];
+    const T* obstacles = teams.obstacles + b * layout.size();
+    std::int32_t* positions = teams.positions + 2 * first;
+    std::int32_t* goals = teams.goals + 2 * first;
+    std::int8_t* executed = scratch.executed.data();
+    const std::uint64_t seed = teams.seeds[b], time = teams.times[b];
+    bool* replaced = teams.replaced + first;
+
+    if (options.pibt) {
+        std::uint8_t* preferences = scratch.pibt.preferences.data();
+        const std::uint64_t key = mix(seed_for(Use::preferences, seed), time);
+        for (int i = 0; i < n; ++i)
+            if (wishes.values != nullptr)
+                prefer_values(wishes.values + (first + i) * num_actions, preferences + i * num_actions);
+            else
+                prefer_action(static_cast<int>(wishes.actions[first + i]), mix(key, i), preferences + i * num_actions);
+        pibt_shield(layout, obstacles, positions, teams.under_way + first, n, seed_for(Use::priorities, seed),
+                    scratch.pibt, executed);
+        for (int i = 0; i < n; ++i) replaced[i] = executed[i] != preferences[i * num_actions];
+    } else {
+        shield(layout, obstacles, positions, wishes.actions + first, n, mix(seed_for(Use::ties, seed), time),
+               scratch.shield, executed);
+        for (int i = 0; i < n; ++i) replaced[i] = executed[i] != wishes.actions[first + i];
+    }
+
+    const Rewards& scheme = options.rewards;
+    std::copy_n(positions, 2 * n, teams.previous + 2 * first);
+    float* rewards = teams.rewards + first;
+    bool *on_goal = teams.on_goal + first, *arrived = teams.arrived + first;
+    bool all_on_goal = true;
+    for (int i = 0; i < n; ++i) {
+        const int row = positions[2 * i], col = positions[2 * i + 1];
+        const int goal_row = goals[2 * i], goal_col = goals[2 * i + 1];
+        const int new_row = row + row_step[executed[i]], new_col = col + col_step[executed[i]];
+        const bool was_there = (row == goal_row) & (col == goal_col) & !options.lifelong;
+        const bool is_there = (new_row == goal_row) & (new_col == goal_col);
+        const bool arrives = is_there & !was_there;
+        positions[2 * i] = new_row;
+        positions[2 * i + 1] = new_col;
+        all_on_goal &= is_there;
+        on_goal[i] = is_there;
+        arrived[i] = arrives;
+        rewards[i] = (is_there ? scheme.on_goal : scheme.off_goal) + (arrives ? scheme.arrival : 0.0f) +
+                     (replaced[i] ? scheme.replaced : 0.0f);
+    }
+    for (int i = 0; i < n; ++i) {
+        teams.arrivals[first + i] += arrived[i];
+        teams.under_way[first + i] = on_goal[i] ? 0 : teams.under_way[first + i] + 1;
+    }
+    if (scheme.closer != 0.0f) {
+        const std::int32_t* before = teams.previous + 2 * first;
+        const Distance* distance = teams.distances + first * layout.size();
+        for (int i = 0; i < n; ++i, distance += layout.size())
+            rewards[i] += scheme.closer * static_cast<float>(distance[layout.cell(before[2 * i], before[2 * i + 1])] -
+                                                             distance[layout.cell(positions[2 * i], positions[2 * i + 1])]);
+    }
+    if (const std::size_t missing = N - n; missing > 0) {
+        std::fill_n(teams.rewards + first + n, missing, 0.0f);
+        for (bool* flags : {teams.replaced, teams.arrived, teams.on_goal}) std::fill_n(flags + first + n, missing, false);
+    }
+    teams.times[b] += 1;
+    teams.terminated[b] = all_on_goal && !options.lifelong;
+    teams.truncated[b] = !teams.terminated[b] && teams.times[b] >= options.max_cycles;
+    teams.ended[b] = teams.terminated[b] || teams.truncated[b];
+    if (teams.terminated[b])
+        for (int i = 0; i < n; ++i) teams.rewards[first + i] += scheme.solved;
+    if (options.lifelong) give_goals(teams, b, scratch);
+}
+
+}  // namespace mapf

@@ -1,0 +1,247 @@
+"""The rules of motion and perception: pure functions over batches of teams.
+
+B is the number of environments, N of robots in each, F = 2 * fov_radius + 3 the side of a view. Maps are passed as
+`bordered(grids, fov_radius)` makes them, so that a view never leaves the array. Every function checks shapes and raises
+ValueError, or TypeError for a wrong dtype.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from mapf_env import _native
+from mapf_env.config import CHANNELS, Channel
+
+Positions = npt.NDArray[np.int32]
+Bordered = npt.NDArray[Any]
+
+_ACTION = np.dtype(np.int64)
+
+
+def bordered(grids: npt.NDArray[np.bool_], fov_radius: int, dtype: npt.DTypeLike = np.float32) -> Bordered:
+    """Grids (B, H, W) inside a border of `fov_radius` obstacles, as 0 and 1 of the dtype that views shall have."""
+    if fov_radius < 1:
+        raise ValueError(f"fov_radius must be at least 1, got {fov_radius}")
+    if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.uint8)):
+        raise ValueError(f"views are float32 or uint8, got {np.dtype(dtype)}")
+    border = ((0, 0), (fov_radius, fov_radius), (fov_radius, fov_radius))
+    return np.pad(grids.astype(dtype), border, constant_values=1)
+
+
+def observe(
+    obstacles: Bordered,
+    positions: Positions,
+    goals: Positions,
+    fov_radius: int,
+    out: npt.NDArray[Any] | None = None,
+) -> npt.NDArray[Any]:
+    """Every robot's field of view, (B, N, 3, F, F), in the layout of the paper's released code.
+
+    The inner window of 2 * fov_radius + 1 cells a side is the view, centred on the robot; the one-cell ring around it
+    carries only the goal when that is out of sight, projected along the line from the robot to it. Channels: obstacles
+    (cells outside the map count), the own goal (exactly one cell), all robots in view, itself included.
+    Source: Li et al. 2020, r_FOV = 4 gives 3 x 11 x 11; the layout is that of the authors' released code.
+    """
+    if out is None:
+        side = 2 * fov_radius + 3
+        out = np.empty((*positions.shape[:2], 3, side, side), obstacles.dtype)
+    _native.observe(obstacles, fov_radius, positions, goals, fov_radius, out)
+    return out
+
+
+def distance_tables(obstacles: Bordered, fov_radius: int, goals: Positions) -> npt.NDArray[np.uint16]:
+    """Steps from each cell of the bordered maps to each goal, (B, N, size); 65535 where there is no way."""
+    return _native.distance_tables(obstacles, fov_radius, goals)
+
+
+def observe_extra(
+    obstacles: Bordered,
+    positions: Positions,
+    fov_radius: int,
+    channel: Channel,
+    *,
+    goals: Positions | None = None,
+    previous: Positions | None = None,
+    distances: npt.NDArray[np.uint16] | None = None,
+) -> npt.NDArray[Any]:
+    """A channel beyond the paper, (B, N, F, F), inside the same ring of zeros.
+
+    cost_to_go: how many steps more than from here it is to the own goal, from each cell in view, by the `distances` of
+    `distance_tables`; within -2 r..2 r for a fov_radius of r, and 2 r where there is no way. As float32 that is divided
+    by 2 r, so -1..1 and negative where the goal is closer; as uint8 it is counted from -2 r, so 0..4 r.
+    other_goals: 1 on the `goals` of other robots.
+    previous_positions: 1 where robots stood one step before, `previous` (B, N, 2).
+    """
+    needed = {"cost_to_go": distances, "other_goals": goals, "previous_positions": previous}[channel]
+    if needed is None:
+        raise ValueError(f"the channel {channel} needs distances, goals or previous, whichever it shows")
+    side = 2 * fov_radius + 3
+    out = np.empty((*positions.shape[:2], side, side), obstacles.dtype)
+    tables = np.zeros((0, 0, 0), np.uint16) if distances is None else distances
+    cells = np.zeros((0, 0, 2), np.int32) if channel == "cost_to_go" else needed
+    _native.observe_channel(obstacles, fov_radius, positions, cells, tables, fov_radius, CHANNELS.index(channel), out)
+    return out
+
+
+def communication_graph(
+    positions: npt.ArrayLike,
+    radius: float | npt.NDArray[np.float64],
+    out: npt.NDArray[np.float32] | None = None,
+    *,
+    weights: Literal["binary", "distance"] = "binary",
+) -> npt.NDArray[np.float32]:
+    """Who hears whom: weights (B, N, N), or (N, N) for positions (N, 2); `radius` is one number or one for each team.
+
+    1, or with `weights="distance"` 1 / distance, where two different robots are closer than `radius` cells (Euclidean,
+    strictly, as in the released code), else 0.
+    """
+    radii = np.asarray(radius, np.float64)
+    if not (radii >= 0).all():
+        raise ValueError(f"the communication radius must not be negative, got {radius}")
+    if weights not in ("binary", "distance"):
+        raise ValueError(f"weights must be binary or distance, got {weights!r}")
+    cells = np.asarray(positions)
+    if cells.ndim not in (2, 3) or cells.shape[-1] != 2:
+        raise ValueError(f"positions must have shape (N, 2) or (B, N, 2), got {cells.shape}")
+    if cells.dtype.kind not in "iu":
+        raise TypeError(f"positions must be integers, got dtype {cells.dtype}")
+    if cells.ndim == 2:
+        return communication_graph(cells[None], radius, weights=weights)[0]
+    if out is None:
+        out = np.empty((*cells.shape[:2], cells.shape[1]), np.float32)
+    _native.communication_graph(cells, np.full(len(cells), radii), weights == "distance", out)
+    return out
+
+
+def connecting_radius(positions: npt.NDArray[np.int32], radius: float) -> float:
+    """The least radius * 1.1^k, k = 0, 1, ..., at which robots at `positions` (N, 2) all reach each other over others.
+
+    Source: the released code of Li et al. 2020, which grows the radius so at the beginning of each case and keeps it.
+    """
+    return _native.connecting_radius(positions, radius)
+
+
+def lose_messages(
+    graph: npt.NDArray[np.float32], loss: float, seeds: npt.NDArray[np.uint64], times: npt.NDArray[np.int64]
+) -> npt.NDArray[np.float32]:
+    """The graph (B, N, N) of which each edge, in each direction for itself, fails with probability `loss`.
+
+    The draw depends on the environment's seed and time, both (B,), and the two robots alone.
+    """
+    heard = np.array(graph, np.float32, order="C")
+    _native.lose_messages(heard, loss, seeds, times)
+    return heard
+
+
+class Edges(NamedTuple):
+    """The communication graphs of B teams as lists of E edges, for networks that pass messages along edges."""
+
+    team: npt.NDArray[np.intp]
+    """(E,) which environment, ascending."""
+    receiver: npt.NDArray[np.intp]
+    """(E,) who hears, 0..N-1."""
+    sender: npt.NDArray[np.intp]
+    """(E,) who is heard."""
+    weight: npt.NDArray[np.float32]
+    """(E,)"""
+    offset: npt.NDArray[np.int32]
+    """(E, 2) rows and columns from the receiver to the sender."""
+
+
+def communication_edges(graph: npt.NDArray[np.float32], positions: Positions) -> Edges:
+    """The edges of dense graphs (B, N, N) between robots at `positions` (B, N, 2)."""
+    team, receiver, sender = np.nonzero(graph)
+    offset = positions[team, sender] - positions[team, receiver]
+    return Edges(team, receiver, sender, graph[team, receiver, sender], offset)
+
+
+def shield(
+    obstacles: Bordered,
+    fov_radius: int,
+    positions: Positions,
+    actions: npt.ArrayLike,
+    seeds: npt.NDArray[np.uint64],
+    times: npt.NDArray[np.int64],
+) -> npt.NDArray[np.int8]:
+    """The actions (B, N) that the paper's collision shield lets through; the others become idle.
+
+    A move off the map, into an obstacle or into the cell of a robot that stays, and both moves of a swap become idle;
+    of several robots that enter one cell, one goes, drawn by the environment's seed and time, both (B,). The rules are
+    applied to their fixed point: what is returned never collides, and a joint action without conflicts is unchanged.
+    Source: Li et al. 2020, section 2 (collision shielding).
+    """
+    return _native.shield(obstacles, fov_radius, positions, as_actions(actions), seeds, times)
+
+
+def pibt_shield(
+    obstacles: Bordered,
+    fov_radius: int,
+    positions: Positions,
+    wanted: npt.ArrayLike,
+    under_way: npt.NDArray[np.int32],
+    seeds: npt.NDArray[np.uint64],
+    times: npt.NDArray[np.int64],
+) -> npt.NDArray[np.int8]:
+    """The actions (B, N) of one step of priority inheritance with backtracking; they never collide.
+
+    `wanted` is a value for each action, (B, N, 5), of which the greatest is wanted most (equal ones in the actions'
+    order), or one action of each robot, (B, N), which stands for the order: that action, idle, the others by lot, drawn
+    by the environment's seed and time. Robots choose in the order of `under_way` (B, N), the longest under way first,
+    equal ones in an order drawn by the seed; a robot in the way of a more important one moves aside if it can.
+    Source: Okumura, Machida, Defago and Tamura 2022.
+    """
+    array = np.asarray(wanted)
+    if array.ndim == 3:
+        values, actions = as_values(array), np.zeros((0, 0), np.int64)
+    else:
+        values, actions = np.zeros((0, 0, 0), np.float32), as_actions(array)
+    return _native.pibt_shield(obstacles, fov_radius, positions, values, actions, under_way, seeds, times)
+
+
+def draw_goals(
+    obstacles: Bordered,
+    fov_radius: int,
+    positions: Positions,
+    goals: Positions,
+    arrived: npt.NDArray[np.bool_],
+    arrivals: npt.NDArray[np.int32],
+    seeds: npt.NDArray[np.uint64],
+) -> Positions:
+    """Goals (B, N, 2) in which the robots that have `arrived` (B, N) have new ones.
+
+    A new goal is uniform over the free cells that the robot can reach, that are no robot's goal and where it does not
+    stand; if there is none, it keeps its goal. The draw depends on the environment's seed, the robot and the number of
+    its `arrivals` (B, N).
+    """
+    drawn = np.array(goals, np.int32, order="C")
+    _native.draw_goals(obstacles, fov_radius, positions, drawn, arrivals, arrived, seeds)
+    return drawn
+
+
+def as_values(values: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """`values` of all five actions as contiguous float32; raises TypeError if they are not numbers."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"values of actions must be numbers, got dtype {array.dtype}")
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def as_actions(actions: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """`actions` as int64; raises TypeError if they are not integers."""
+    array = np.asarray(actions)
+    if array.dtype.kind not in "iu":
+        raise TypeError(f"actions must be integers 0..4 (up, left, down, right, idle), got dtype {array.dtype}")
+    return array if array.dtype == _ACTION else array.astype(_ACTION)
+
+
+def move(positions: Positions, actions: npt.NDArray[np.int8]) -> Positions:
+    """Positions (B, N, 2) after the shielded actions (B, N)."""
+    return _native.move(positions, actions)
+
+
+def action_mask(obstacles: Bordered, fov_radius: int, positions: Positions) -> npt.NDArray[np.int8]:
+    """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle."""
+    return _native.action_mask(obstacles, fov_radius, positions)

@@ -1,0 +1,103 @@
+"""All that B teams carry from step to step, in arrays that the native core changes in place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mapf_env.config import EnvConfig
+
+
+@dataclass(eq=False, slots=True)
+class TeamState:
+    """The arrays of B environments of at most N robots; `size` is a map's number of cells, its border included."""
+
+    streams: npt.NDArray[np.uint64]
+    """(B,) the seed of each environment's stream of episodes."""
+    episodes: npt.NDArray[np.uint64]
+    """(B,) how many episodes of its stream have begun."""
+    seeds: npt.NDArray[np.uint64]
+    """(B,) the seed of the episode."""
+    grids: npt.NDArray[np.bool_]
+    """(B, H, W) the maps."""
+    obstacles: npt.NDArray[Any]
+    """(B, H + 2 r, W + 2 r) the maps inside their borders, in the views' dtype."""
+    team_sizes: npt.NDArray[np.int32]
+    """(B,) how many robots are there."""
+    positions: npt.NDArray[np.int32]
+    """(B, N, 2)"""
+    goals: npt.NDArray[np.int32]
+    """(B, N, 2)"""
+    previous: npt.NDArray[np.int32]
+    """(B, N, 2) the positions one step before; at reset the positions."""
+    under_way: npt.NDArray[np.int32]
+    """(B, N) steps since the robot was on its goal, or since reset."""
+    arrivals: npt.NDArray[np.int32]
+    """(B, N) how often the robot has arrived."""
+    comm_radius: npt.NDArray[np.float64]
+    """(B,)"""
+    regions: npt.NDArray[np.int32]
+    """(B, size) the connected region of each cell; empty unless goals change."""
+    distances: npt.NDArray[np.uint16]
+    """(B, N, size) steps to the goal; empty unless they are needed."""
+    times: npt.NDArray[np.int64]
+    """(B,) steps since reset."""
+    started: npt.NDArray[np.bool_]
+    """(B,) the environment has been reset."""
+    ended: npt.NDArray[np.bool_]
+    """(B,) the environment must be reset."""
+    rewards: npt.NDArray[np.float32]
+    """(B, N) of the last step, and so are the following."""
+    terminated: npt.NDArray[np.bool_]
+    """(B,)"""
+    truncated: npt.NDArray[np.bool_]
+    """(B,)"""
+    replaced: npt.NDArray[np.bool_]
+    """(B, N)"""
+    arrived: npt.NDArray[np.bool_]
+    """(B, N)"""
+    on_goal: npt.NDArray[np.bool_]
+    """(B, N)"""
+    action_mask: npt.NDArray[np.int8]
+    """(B, N, 5) as of the last time it was asked for."""
+
+    @staticmethod
+    def empty(num_envs: int, config: EnvConfig) -> TeamState:
+        """Before the first reset; the streams are seeded at random."""
+        B, N, border = num_envs, config.num_agents, 2 * config.fov_radius
+        padded = config.height + border, config.width + border
+        size = padded[0] * padded[1]
+        return TeamState(
+            streams=np.array(np.random.SeedSequence().generate_state(B, np.uint64), np.uint64),
+            episodes=np.zeros(B, np.uint64),
+            seeds=np.zeros(B, np.uint64),
+            grids=np.ones((B, config.height, config.width), np.bool_),
+            obstacles=np.ones((B, *padded), config.dtype),
+            team_sizes=np.zeros(B, np.int32),
+            positions=np.zeros((B, N, 2), np.int32),
+            goals=np.zeros((B, N, 2), np.int32),
+            previous=np.zeros((B, N, 2), np.int32),
+            under_way=np.zeros((B, N), np.int32),
+            arrivals=np.zeros((B, N), np.int32),
+            comm_radius=np.full(B, config.comm_radius, np.float64),
+            regions=np.zeros((B, size if config.task == "lifelong" else 0), np.int32),
+            distances=np.zeros((B, N, size if config.needs_distances else 0), np.uint16),
+            times=np.zeros(B, np.int64),
+            started=np.zeros(B, np.bool_),
+            ended=np.ones(B, np.bool_),
+            rewards=np.zeros((B, N), np.float32),
+            terminated=np.zeros(B, np.bool_),
+            truncated=np.zeros(B, np.bool_),
+            replaced=np.zeros((B, N), np.bool_),
+            arrived=np.zeros((B, N), np.bool_),
+            on_goal=np.zeros((B, N), np.bool_),
+            action_mask=np.zeros((B, N, 5), np.int8),
+        )
+
+    def begin(self, chosen: npt.NDArray[np.intp] | slice, **begun: npt.ArrayLike) -> None:
+        """Begin episodes of the chosen environments: write the given arrays, and zeros into what counts steps."""
+        for name, value in (dict.fromkeys(("under_way", "arrivals", "times", "ended"), 0) | begun).items():
+            getattr(self, name)[chosen] = value

@@ -1,0 +1,216 @@
+"""Laws of the random maps and instances."""
+
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import oracles
+import strategies
+from mapf_env import Instance, random_cases, random_instance, random_map, random_maps
+from mapf_env.generation import MapStyle
+
+Style = Literal["cells", "walls"]
+STYLES: tuple[Style, ...] = ("cells", "walls")
+
+
+@given(strategies.seeds, st.integers(1, 12), st.integers(1, 12), st.floats(0, 0.999))
+def test_cells_reach_every_density_exactly_and_stay_connected(
+    seed: int, height: int, width: int, density: float
+) -> None:
+    if round(density * height * width) == height * width:
+        with pytest.raises(ValueError, match=r"leave no free cell .*: lower the density"):
+            random_map(height=height, width=width, density=density, seed=seed)
+        return
+    grid = random_map(height=height, width=width, density=density, seed=seed)
+    assert grid.shape == (height, width)
+    assert grid.sum() == round(density * height * width)
+    assert len(oracles.regions(grid)) == 1
+
+
+@given(strategies.seeds, st.integers(8, 25), st.integers(8, 25), st.sampled_from([0.0, 0.05, 0.1, 0.2]))
+def test_walls_reach_usual_densities_exactly_and_lie_on_even_lines(
+    seed: int, height: int, width: int, density: float
+) -> None:
+    grid = random_map(height=height, width=width, density=density, style="walls", seed=seed)
+    assert grid.sum() == round(density * height * width)
+    assert len(oracles.regions(grid)) == 1
+    assert not grid[1::2, 1::2].any()
+
+
+def test_walls_are_longer_than_cells() -> None:
+    def touching(style: Style) -> float:
+        grids = random_maps(range(200), style=style)
+        return float((grids[:, 1:] & grids[:, :-1]).sum() + (grids[:, :, 1:] & grids[:, :, :-1]).sum()) / 200
+
+    assert touching("walls") > 3 * touching("cells")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"density": 0.99},
+        {"density": 0.99, "style": "walls"},
+        {"height": 1, "width": 2, "density": 0.5},
+        {"height": 1, "width": 2, "density": 0.99},
+        {"height": 1, "width": 1},
+        {"height": 2, "width": 2, "density": 0.75, "style": "walls"},
+        {"height": 64, "width": 64, "density": 0.7, "style": "walls"},
+        {"density": 0.1, "num_agents": 361},
+        {"num_agents": 10**9},
+    ],
+)
+def test_no_room_ends_with_an_error(settings: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"(lower the density|fewer agents)"):
+        random_instance(seed=0, **settings)
+
+
+def test_crowds_to_the_last_cell_are_placed() -> None:
+    for seed in range(50):
+        instance = random_instance(height=3, width=3, density=0, num_agents=9, seed=seed)
+        assert len(set(oracles.cells(instance.starts))) == len(set(oracles.cells(instance.goals))) == 9
+        assert (instance.starts != instance.goals).any(axis=1).all()
+
+
+@given(strategies.settings(max_agents=40), strategies.seeds)
+def test_robots_get_distinct_starts_and_distinct_goals_off_their_starts(settings: dict[str, Any], seed: int) -> None:
+    names = ("height", "width", "density", "num_agents", "style")
+    instance = random_instance(seed=seed, **{name: settings[name] for name in names})
+    starts, goals = oracles.cells(instance.starts), oracles.cells(instance.goals)
+    assert len(set(starts)) == len(set(goals)) == instance.num_agents == settings["num_agents"]
+    assert not any(start == goal for start, goal in zip(starts, goals, strict=True))
+    assert set(starts + goals) <= oracles.regions(instance.grid)[0]
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_the_map_depends_on_its_own_arguments_only(style: Style) -> None:
+    grid = random_map(style=style, seed=3)
+    for num_agents in (1, 10, 60):
+        assert (random_instance(style=style, num_agents=num_agents, seed=3).grid == grid).all()
+    assert (random_maps([9, 3], style=style)[1] == grid).all()
+    assert (random_maps([9, 3], style=style)[0] != grid).any()
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_equal_seeds_give_equal_instances_and_others_differ(style: Style) -> None:
+    instances = [random_instance(style=style, seed=seed) for seed in range(50)]
+    assert instances == [random_instance(style=style, seed=seed) for seed in range(50)]
+    assert len(set(instances)) == 50
+    assert random_instance() != random_instance()
+
+
+def test_styles_differ() -> None:
+    assert (random_map(style="cells", seed=1) != random_map(style="walls", seed=1)).any()
+
+
+def test_placement_is_uniform_over_the_free_cells() -> None:
+    grid = np.zeros((4, 4), bool)
+    grid[1, 1] = grid[2, 3] = True
+    starts, goals = random_cases(range(7000), np.broadcast_to(grid, (7000, 4, 4)), 3)
+    for robot in range(3):
+        for cells in (starts[:, robot], goals[:, robot]):
+            count = np.zeros((4, 4), int)
+            np.add.at(count, tuple(cells.T), 1)
+            assert (count[grid] == 0).all()
+            assert count[~grid].min() > 400  # 500 expected, standard deviation 22
+            assert count[~grid].max() < 600
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_where_robots_stand_says_nothing_about_the_map_of_the_same_seed(style: Style) -> None:
+    """Robots start beside obstacles as often as chance has it: map and placement draw from streams of their own."""
+    seeds = np.arange(4000)
+    grids = random_maps(seeds, style=style)
+    padded = np.pad(grids, ((0, 0), (1, 1), (1, 1))).astype(float)
+    beside = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
+    chance = (beside * ~grids).sum() / (~grids).sum()
+    for cells in random_cases(seeds, grids, 10):
+        seen = beside[np.arange(len(seeds))[:, None], cells[..., 0], cells[..., 1]].mean(axis=0)
+        assert np.abs(seen - chance).max() < 0.06  # five standard errors
+
+
+def test_a_given_map_is_kept_and_its_largest_region_used() -> None:
+    grid = np.array([[0, 0, 0, 1, 0], [0, 0, 0, 1, 0]], bool)
+    for seed in range(20):
+        instance = random_instance(grid=grid, num_agents=6, seed=seed)
+        assert (instance.grid == grid).all()
+        assert instance.starts[:, 1].max() <= 2
+        assert instance.goals[:, 1].max() <= 2
+    with pytest.raises(ValueError, match="the largest connected free region has 6 cells, too few for 7 agents"):
+        random_instance(grid=grid, num_agents=7, seed=0)
+
+
+def test_global_random_state_is_neither_read_nor_written() -> None:
+    state = np.random.get_state()  # noqa: NPY002
+    first = random_instance(seed=5)
+    np.random.seed(1)  # noqa: NPY002
+    assert random_instance(seed=5) == first
+    random_instance()
+    assert random_map(seed=5) is not None
+    drawn = np.random.rand()  # noqa: NPY002
+    np.random.seed(1)  # noqa: NPY002
+    assert np.random.rand() == drawn  # noqa: NPY002
+    np.random.set_state(state)  # noqa: NPY002
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"density": 1.0}, r"density must lie in \[0, 1\), got 1.0"),
+        ({"density": -0.1}, r"density must lie in \[0, 1\)"),
+        ({"density": float("nan")}, r"density must lie in \[0, 1\)"),
+        ({"height": 0}, "height=0"),
+        ({"width": -3}, "width=-3"),
+        ({"style": "cave"}, "style must be one of cells, walls, maze, room, warehouse, empty, got 'cave'"),
+        ({"num_agents": 0}, "num_agents must be at least 1, got 0"),
+        ({"seed": -1}, "seed must .*-1"),
+        ({"seed": 2**64}, "seed must .*18446744073709551616"),
+        ({"grid": np.ones((2, 2), bool)}, "the largest connected free region has 0 cells"),
+    ],
+)
+def test_bad_settings_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        random_instance(**settings)
+
+
+def test_bad_seeds_are_refused() -> None:
+    for seeds in ([0.5], [[1]], [-1], 3):
+        with pytest.raises(ValueError, match="seeds must be a vector of non-negative integers"):
+            random_maps(seeds)
+    with pytest.raises(ValueError, match="give one seed for each grid"):
+        random_cases([1, 2], np.zeros((3, 4, 4), bool), 2)
+
+
+def test_large_maps() -> None:
+    for style in STYLES:
+        density = 0.4 if style == "cells" else 0.2
+        grid = random_map(height=256, width=256, density=density, style=style, seed=0)
+        assert grid.sum() == round(density * 256 * 256)
+    assert isinstance(random_instance(height=256, width=256, num_agents=1000, seed=0), Instance)
+
+
+@given(
+    st.integers(1, 25), st.integers(1, 25), strategies.seeds, st.sampled_from(["maze", "room", "warehouse", "empty"])
+)
+def test_the_other_styles_are_connected(height: int, width: int, seed: int, style: MapStyle) -> None:
+    grid = random_map(height=height, width=width, style=style, seed=seed)
+    assert grid.shape == (height, width)
+    assert len(oracles.regions(grid)) == 1
+    assert (grid == random_map(height=height, width=width, style=style, seed=seed)).all()
+    if style == "empty":
+        assert not grid.any()
+
+
+def test_the_other_styles_look_as_they_are_called() -> None:
+    maze, room, warehouse = (random_map(height=23, width=29, style=s, seed=1) for s in ("maze", "room", "warehouse"))
+    assert not (~maze[:-1, :-1] & ~maze[1:, :-1] & ~maze[:-1, 1:] & ~maze[1:, 1:]).any(), "no open square"
+    assert maze[1::2, 1::2].all()
+    assert not maze[::2, ::2].any()
+    assert room[5, 5]
+    assert room[5].sum() == 29 - 5, "five doors along a wall"
+    assert warehouse[1:3, 2:12].all()
+    assert not warehouse[::3].any()
+    for style in ("maze", "room"):
+        assert (random_map(style=style, seed=1) != random_map(style=style, seed=2)).any()  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,400 @@
+"""Laws of what goes beyond the paper: each option against its definition, and all of them at once against the rules."""
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from gymnasium.vector import AutoresetMode
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+import oracles
+import strategies
+from mapf_env import SCHEMES, BatchedEnv, Instance, Observation, Rewards, communication_edges, random_instance, rules
+from mapf_env.config import CHANNELS
+
+
+def by_the_rules(env: BatchedEnv, previous: npt.NDArray[np.int32], seeds: npt.NDArray[np.uint64]) -> Observation:
+    """What the robots perceive, put together from the pure functions."""
+    config, positions, goals = env.config, env.positions, env.goals
+    maps = rules.bordered(env.grids, config.fov_radius, config.dtype)
+    distances = rules.distance_tables(maps, config.fov_radius, goals)
+    planes = [rules.observe(maps, positions, goals, config.fov_radius)]
+    for channel in config.extra_channels:
+        shown = {"goals": goals, "previous": previous, "distances": distances}
+        planes.append(rules.observe_extra(maps, positions, config.fov_radius, channel, **shown)[:, :, None])  # pyright: ignore[reportArgumentType]
+    graph = rules.communication_graph(positions, env.comm_radius, weights=config.comm_weights)
+    return Observation(np.concatenate(planes, 2), rules.lose_messages(graph, config.message_loss, seeds, env.times))
+
+
+def episode_seeds(env: BatchedEnv) -> npt.NDArray[np.uint64]:
+    return env._state.seeds.copy()
+
+
+@given(strategies.all_settings(), strategies.seeds, st.integers(1, 4), st.integers(1, 3))
+@hypothesis_settings(max_examples=150)
+def test_the_fused_step_is_the_rules_one_after_another(
+    settings: dict[str, Any], seed: int, num_envs: int, threads: int
+) -> None:
+    env, generator = BatchedEnv(num_envs, threads=threads, **settings), np.random.default_rng(seed)
+    config, N = env.config, env.num_agents
+    observation = env.reset(seed)
+    seeds, before = episode_seeds(env), env.positions
+    under_way, arrivals = np.zeros((num_envs, N), np.int32), np.zeros((num_envs, N), np.int32)
+    for time in range(config.max_cycles):
+        expected = by_the_rules(env, before, seeds)
+        assert np.array_equal(observation.fov, expected.fov)
+        assert np.array_equal(observation.graph, expected.graph)
+        before, goals = env.positions, env.goals
+        maps = rules.bordered(env.grids, config.fov_radius, config.dtype)
+        wanted = generator.integers(0, 5, (num_envs, N))
+        values = generator.normal(size=(num_envs, N, 5)).astype(np.float32)
+        by_values = config.shield == "pibt" and time % 2 == 1
+        times = np.full(num_envs, time)
+        if config.shield == "idle":
+            executed = rules.shield(maps, config.fov_radius, before, wanted, seeds, times)
+        else:
+            asked = values if by_values else wanted
+            executed = rules.pibt_shield(maps, config.fov_radius, before, asked, under_way, seeds, times)
+            wanted = values.argmax(-1) if by_values else wanted
+        step = env.step(values if by_values else wanted)
+        observation = step.observation
+        after = rules.move(before, executed)
+        assert (env.positions == after).all()
+        assert (step.replaced == (executed != wanted)).all()
+        on_goal, was_on_goal = (after == goals).all(-1), (before == goals).all(-1)
+        lifelong = config.task == "lifelong"
+        arrived = on_goal if lifelong else on_goal & ~was_on_goal
+        assert (step.arrived == arrived).all()
+        arrivals += arrived
+        under_way = np.where(on_goal, 0, under_way + 1).astype(np.int32)
+        solved = on_goal.all(1) & (not lifelong)
+        assert (step.terminated == solved).all()
+        assert (step.truncated == (~solved & (time + 1 == config.max_cycles))).all()
+        scheme = config.rewards
+        expected_rewards = np.where(on_goal, scheme.on_goal, scheme.off_goal) + scheme.arrival * arrived
+        expected_rewards = expected_rewards + scheme.replaced * step.replaced + scheme.solved * solved[:, None]
+        for b in range(num_envs) if scheme.closer else []:
+            for i in range(N):
+                steps = oracles.distances(env.grids[b], tuple(goals[b, i].tolist()))
+                closer = steps[tuple(before[b, i].tolist())] - steps[tuple(after[b, i].tolist())]
+                expected_rewards[b, i] += scheme.closer * closer
+        assert np.allclose(step.rewards, expected_rewards)
+        if lifelong:
+            assert (
+                env.goals == rules.draw_goals(maps, config.fov_radius, after, goals, arrived, arrivals, seeds)
+            ).all()
+        else:
+            assert (env.goals == goals).all()
+        if (step.terminated | step.truncated).any():
+            return
+
+
+@given(strategies.crowds(max_side=6), st.data(), strategies.seeds)
+def test_pibt_never_collides_and_the_first_gets_what_it_wants(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, seed: int
+) -> None:
+    grid, team = crowd
+    n, generator = len(team), np.random.default_rng(seed)
+    maps, positions = rules.bordered(grid[None], 2), np.array([team], np.int32)
+    under_way = np.array([data.draw(st.permutations(range(n)))], np.int32)
+    values = generator.normal(size=(1, n, 5)).astype(np.float32)
+    seeds, times = np.array([seed], np.uint64), np.zeros(1, np.int64)
+    executed = rules.pibt_shield(maps, 2, positions, values, under_way, seeds, times)[0].tolist()
+    after = [oracles.moved(cell, action) for cell, action in zip(team, executed, strict=True)]
+    assert oracles.faults(grid, team, after) == []
+    wanted = np.array([data.draw(strategies.joint_actions(n))])
+    executed = rules.pibt_shield(maps, 2, positions, wanted, under_way, seeds, times)[0].tolist()
+    after = [oracles.moved(cell, action) for cell, action in zip(team, executed, strict=True)]
+    assert oracles.faults(grid, team, after) == []
+    free, first = oracles.free_cells(grid), int(under_way[0].argmax())
+    target = oracles.moved(team[first], int(wanted[0, first]))
+    if target in free and target not in team:
+        assert executed[first] == wanted[0, first], "nobody is more important, and the cell is empty"
+
+
+@given(strategies.crowds(max_side=5), st.data(), strategies.seeds)
+def test_pibt_lets_harmless_joint_actions_pass(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, seed: int
+) -> None:
+    grid, team = crowd
+    wanted = oracles.harmless(grid, team, data.draw(strategies.joint_actions(len(team))))
+    maps, positions = rules.bordered(grid[None], 1), np.array([team], np.int32)
+    under_way = np.zeros((1, len(team)), np.int32)
+    executed = rules.pibt_shield(
+        maps, 1, positions, [wanted], under_way, np.array([seed], np.uint64), np.zeros(1, np.int64)
+    )
+    assert executed[0].tolist() == wanted
+
+
+def test_pibt_pushes_an_idle_robot_aside() -> None:
+    grid = np.zeros((2, 3), bool)
+    maps, positions = rules.bordered(grid[None], 1), np.array([[(0, 0), (0, 1)]], np.int32)
+    under_way = np.array([[5, 0]], np.int32)
+    executed = rules.pibt_shield(maps, 1, positions, [[3, 4]], under_way, np.zeros(1, np.uint64), np.zeros(1, np.int64))
+    assert executed[0, 0] == oracles.RIGHT
+    assert executed[0, 1] != oracles.IDLE
+
+
+@given(strategies.crowds(max_side=8), st.data(), st.integers(1, 4))
+def test_extra_channels_are_as_defined(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, radius: int
+) -> None:
+    grid, team = crowd
+    free = sorted(oracles.free_cells(grid))
+    goals, before = (data.draw(st.permutations(free))[: len(team)] for _ in range(2))
+    for dtype in (np.float32, np.uint8):
+        maps = rules.bordered(grid[None], radius, dtype)
+        positions, targets, previous = (np.array([cells], np.int32) for cells in (team, goals, before))
+        distances = rules.distance_tables(maps, radius, targets)
+        shown = {"goals": targets, "previous": previous, "distances": distances}
+        views = {c: rules.observe_extra(maps, positions, radius, c, **shown)[0] for c in CHANNELS}  # pyright: ignore[reportArgumentType]
+        for i, (row, col) in enumerate(team):
+            steps = oracles.distances(grid, goals[i])
+            if team[i] not in steps:
+                continue  # no instance has such a robot
+            for r in range(-radius - 1, radius + 2):
+                for c in range(-radius - 1, radius + 2):
+                    cell, at = (row + r, col + c), (i, r + radius + 1, c + radius + 1)
+                    inside = max(abs(r), abs(c)) <= radius
+                    assert views["other_goals"][at] == (inside and cell in goals and cell != goals[i])
+                    assert views["previous_positions"][at] == (inside and cell in before)
+                    more = steps[cell] - steps[team[i]] if cell in steps else 2 * radius
+                    more = min(max(more, -2 * radius), 2 * radius)
+                    expected = more + 2 * radius if dtype == np.uint8 else np.float32(more) / np.float32(2 * radius)
+                    assert views["cost_to_go"][at] == (expected if inside else 0)
+
+
+@given(strategies.crowds(max_side=8), st.floats(0.5, 6))
+def test_distance_weights_and_edges(crowd: tuple[oracles.Grid, list[oracles.Cell]], radius: float) -> None:
+    team = np.array([crowd[1]], np.int32)
+    graph = rules.communication_graph(team, radius, weights="distance")
+    binary = rules.communication_graph(team, radius)
+    assert ((graph > 0) == (binary > 0)).all()
+    edges = communication_edges(graph, team)
+    assert len(edges.team) == int(binary.sum())
+    for b, i, j, weight, offset in zip(*edges, strict=True):
+        assert math.isclose(weight, 1 / math.dist(team[b, i], team[b, j]), rel_tol=1e-6)
+        assert (team[b, i] + offset == team[b, j]).all()
+
+
+@given(strategies.crowds(max_side=8), st.floats(0.1, 6))
+def test_the_connecting_radius_is_the_least_that_connects(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], start: float
+) -> None:
+    def connected(radius: float) -> bool:
+        hears, reached = oracles.communication_graph(crowd[1], radius), {0}
+        while True:
+            more = {j for i in reached for j in range(len(crowd[1])) if hears[i, j]} | reached
+            if more == reached:
+                return len(reached) == len(crowd[1])
+            reached = more
+
+    expected = start
+    while not connected(expected):
+        expected *= 1.1
+    assert rules.connecting_radius(np.array(crowd[1], np.int32), start) == expected
+
+
+def test_messages_are_lost_as_often_as_asked_and_anew_in_each_step() -> None:
+    graph = np.ones((1, 30, 30), np.float32)
+    lost = [rules.lose_messages(graph, 0.3, np.zeros(1, np.uint64), np.array([time])) for time in range(20)]
+    assert abs(1 - np.mean(lost) - 0.3) < 0.02  # five standard deviations of 18,000 draws
+    assert any((a != b).any() for a, b in pairwise(lost))
+    assert (lost[0] != lost[0].transpose(0, 2, 1)).any(), "each direction for itself"
+    assert not rules.lose_messages(graph, 1.0, np.zeros(1, np.uint64), np.zeros(1, np.int64)).any()
+
+
+def test_lifelong_goals_are_reachable_distinct_and_uniform() -> None:
+    env = BatchedEnv(1, num_agents=3, height=3, width=4, density=0.0, task="lifelong", max_cycles=10**6)
+    env.reset(seed=0)
+    generator, counts, throughput = np.random.default_rng(0), np.zeros((3, 4)), 0
+    for _ in range(6000):
+        goals = env.goals
+        step = env.step(generator.integers(0, 5, (1, 3)))
+        assert not step.terminated.any()
+        assert len(np.unique(env.goals[0], axis=0)) == 3
+        throughput += int(step.arrived.sum())
+        for i in np.flatnonzero(step.arrived[0]):
+            assert (env.goals[0, i] != goals[0, i]).any()
+            counts[tuple(env.goals[0, i])] += 1
+    assert counts.sum() == throughput > 400
+    assert counts.min() > 0.5 * counts.mean()
+
+
+def test_a_lifelong_robot_without_a_free_cell_keeps_its_goal() -> None:
+    full = Instance(np.zeros((1, 2), bool), [[0, 0], [0, 1]], [[0, 1], [0, 0]])
+    env = BatchedEnv(1, num_agents=2, height=1, width=2, density=0.0, task="lifelong")
+    env.reset(instances=[full.at(full.goals)])
+    assert env.step([[4, 4]]).arrived.all()
+    assert (env.goals[0] == full.goals).all()
+
+
+def test_reward_schemes() -> None:
+    corridor = Instance(np.zeros((1, 4), bool), [[0, 0], [0, 3]], [[0, 1], [0, 3]])
+
+    def rewards(scheme: str | Rewards, *joint: list[int]) -> list[float]:
+        env = BatchedEnv(1, num_agents=2, height=1, width=4, density=0, reward=scheme)
+        env.reset(instances=[corridor])
+        return [env.step([actions]).rewards[0].tolist() for actions in joint][-1]
+
+    assert rewards("flowtime", [4, 4]) == [-1, 0]
+    assert rewards("shaped", [3, 1]) == [1, -2]
+    assert rewards("arrival", [3, 1]) == [1, 0]
+    assert rewards("solved", [3, 4]) == [1, 1]
+    assert rewards(Rewards(replaced=-0.5), [0, 4]) == [-0.5, 0]
+    assert set(SCHEMES) == {"flowtime", "shaped", "arrival", "solved"}
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_autoreset_plays_the_episodes_that_a_manual_reset_plays(mode: AutoresetMode) -> None:
+    settings: dict[str, Any] = {"num_agents": 3, "height": 4, "width": 4, "max_cycles": 9}
+    auto, singles = BatchedEnv(5, autoreset=mode, **settings), [BatchedEnv(1, **settings) for _ in range(5)]
+    auto.reset(seed=1)
+    for b, single in enumerate(singles):
+        single.reset(seed=1 + b)
+    generator, due = np.random.default_rng(0), np.zeros(5, bool)
+    for _ in range(100):
+        actions = generator.integers(0, 5, (5, 3))
+        step = auto.step(actions)
+        ended = step.terminated | step.truncated
+        final = 0
+        for b, single in enumerate(singles):
+            if mode is AutoresetMode.NEXT_STEP and due[b]:
+                assert np.array_equal(step.observation.fov[b], single.reset().fov[0])
+                assert not step.rewards[b].any()
+                assert not ended[b]
+                continue
+            expected = single.step(actions[b : b + 1])
+            for one, other in zip(step[1:], expected[1:], strict=True):
+                assert np.array_equal(one[b], other[0])  # pyright: ignore[reportIndexIssue]
+            seen = expected.observation.fov[0]
+            if mode is AutoresetMode.SAME_STEP and ended[b]:
+                assert auto.final_observation is not None
+                assert np.array_equal(auto.final_observation.fov[final], seen)
+                final += 1
+                seen = single.reset().fov[0]
+            assert np.array_equal(step.observation.fov[b], seen)
+        assert (auto.final_observation is None) == (final == 0)
+        due = ended
+
+
+def test_smaller_instances_play_in_a_batch_as_they_play_alone() -> None:
+    sizes = ((3, 4, 5), (6, 7, 6), (2, 3, 7))
+    instances = [random_instance(num_agents=n, height=h, width=w, seed=n) for n, h, w in sizes]
+    options: dict[str, Any] = {"shield": "pibt", "extra_channels": CHANNELS, "message_loss": 0.2, "reward": "shaped"}
+    batch = BatchedEnv(3, num_agents=6, height=7, width=7, fill=True, **options)
+    seen, generator = batch.reset([7, 8, 9], instances=instances), np.random.default_rng(0)
+    alone = [BatchedEnv(1, num_agents=n, height=h, width=w, density=0, **options) for n, h, w in sizes]
+    apart = [env.reset(7 + b, instances=[instances[b]]) for b, env in enumerate(alone)]
+    assert batch.present.sum(1).tolist() == [3, 6, 2]
+    for _ in range(12):
+        for b, (n, *_) in enumerate(sizes):
+            assert np.array_equal(seen.fov[b, :n], apart[b].fov[0])
+            assert np.array_equal(seen.graph[b, :n, :n], apart[b].graph[0])
+            assert not seen.fov[b, n:].any()
+            assert not seen.graph[b, n:].any()
+            assert not seen.graph[b, :, n:].any()
+            assert np.array_equal(batch.action_mask()[b, :n], alone[b].action_mask()[0])
+            assert batch.action_mask()[b, n:].tolist() == [[0, 0, 0, 0, 1]] * (6 - n)
+        actions = generator.integers(0, 5, (3, 6))
+        step = batch.step(actions)
+        steps = [env.step(actions[b : b + 1, :n]) for b, (env, (n, *_)) in enumerate(zip(alone, sizes, strict=True))]
+        for b, (n, *_) in enumerate(sizes):
+            assert np.array_equal(step.rewards[b, :n], steps[b].rewards[0])
+            assert not step.rewards[b, n:].any()
+            assert step.terminated[b] == steps[b].terminated[0]
+        if (step.terminated | step.truncated).any():
+            break
+        seen, apart = step.observation, [one.observation for one in steps]
+
+
+def test_cases_are_drawn_by_the_seed() -> None:
+    cases = [random_instance(num_agents=n, height=5, width=5, seed=n) for n in (2, 3, 4)]
+    env = BatchedEnv(64, num_agents=4, height=5, width=5, cases=cases, fill=True, autoreset=AutoresetMode.SAME_STEP)
+    env.reset(seed=0)
+    assert set(env.present.sum(1).tolist()) == {2, 3, 4}
+    starts = env.positions
+    env.reset(seed=0)
+    assert (env.positions == starts).all()
+    with pytest.raises(ValueError, match="there are no cases to play"):
+        BatchedEnv(1, cases=[])
+    with pytest.raises(ValueError, match="the instance has 2 agents, the environment 4"):
+        BatchedEnv(1, num_agents=4, height=5, width=5, cases=cases)
+
+
+def test_observations_are_written_into_the_callers_memory() -> None:
+    env, control = BatchedEnv(2, num_agents=3), BatchedEnv(2, num_agents=3)
+    out = env.buffers()
+    assert env.reset(seed=0, out=out) is out
+    control.reset(seed=0)
+    step, expected = env.step([[0, 1, 2]] * 2, out=out), control.step([[0, 1, 2]] * 2)
+    assert step.observation is out
+    assert np.array_equal(out.fov, expected.observation.fov)
+    assert env.observe(out=out) is out
+    wrong = Observation(np.empty((2, 3, 3, 11, 10), np.float32), out.graph)
+    with pytest.raises(ValueError, match="the memory for views must have shape"):
+        env.step([[4, 4, 4]] * 2, out=wrong)
+    with pytest.raises(TypeError):
+        env.step([[4, 4, 4]] * 2, out=Observation(out.fov.astype(np.float64), out.graph))
+
+
+def test_torch_tensors_are_written_too() -> None:
+    torch = pytest.importorskip("torch")
+    env = BatchedEnv(2, num_agents=3)
+    fov, graph = torch.zeros(2, 3, 3, 11, 11), torch.zeros(2, 3, 3)
+    env.reset(seed=0, out=Observation(fov, graph))
+    assert np.array_equal(fov.numpy(), env.observe().fov)
+
+
+def test_threads_change_nothing() -> None:
+    def record(threads: int) -> list[Any]:
+        env, generator = BatchedEnv(7, threads=threads, num_agents=6, max_cycles=10**6), np.random.default_rng(0)
+        env.reset(seed=0)
+        return [env.step(generator.integers(0, 5, (7, 6))) for _ in range(30)]
+
+    for one, other in zip(record(1), record(3), strict=True):
+        assert np.array_equal(one.observation.fov, other.observation.fov)
+        assert np.array_equal(one.rewards, other.rewards)
+
+
+def test_nothing_is_observed_before_the_first_reset() -> None:
+    with pytest.raises(RuntimeError, match="nothing to observe before the first reset"):
+        BatchedEnv(1).observe()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"message_loss": 1.5}, r"message_loss must lie in \[0, 1\], got 1.5"),
+        ({"comm_range": "far"}, "comm_range must be one of fixed, connected"),
+        ({"comm_range": "connected", "comm_radius": 0.0}, "comm_radius must be positive to grow"),
+        ({"comm_weights": "loud"}, "comm_weights must be one of binary, distance"),
+        ({"task": "endless"}, "task must be one of one_shot, lifelong"),
+        ({"reward": "gold"}, "reward must be Rewards or one of flowtime"),
+        ({"extra_channels": ("smell",)}, "extra_channels must be some of cost_to_go"),
+        ({"extra_channels": ("other_goals", "other_goals")}, "extra_channels must be some of"),
+        ({"extra_channels": ("cost_to_go",), "dtype": "uint8", "fov_radius": 64}, "a fov_radius of at most 63"),
+    ],
+)
+def test_options_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        BatchedEnv(1, **settings)
+
+
+def test_wrong_values_of_actions_are_refused() -> None:
+    idle, pibt = BatchedEnv(1, num_agents=2), BatchedEnv(1, num_agents=2, shield="pibt")
+    for env in (idle, pibt):
+        env.reset(seed=0)
+    with pytest.raises(ValueError, match='need shield="pibt"'):
+        idle.step(np.zeros((1, 2, 5)))
+    with pytest.raises(ValueError, match=r"values of actions must have shape \(1, 2, 5\), got \(1, 2, 4\)"):
+        pibt.step(np.zeros((1, 2, 4)))
+    with pytest.raises(ValueError, match="a value of agent 1 in environment 0 is not a number"):
+        pibt.step(np.array([[[0.0] * 5, [0.0, np.nan, 0, 0, 0]]]))
+    with pytest.raises(ValueError, match="threads must be at least 1"):
+        BatchedEnv(1, threads=0)

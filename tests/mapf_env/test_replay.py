@@ -1,0 +1,107 @@
+"""The page of a replay, in a real headless Chromium where there is one."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapf_env import EnvConfig, Instance, Solution, random_instance, replay
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+ACTIONS = """
+<script>{
+window.onerror = (message) => { document.body.dataset.said = JSON.stringify({error: message}); };
+const said = [], status = document.getElementById("status"), box = canvas.getBoundingClientRect();
+const scale = Math.max(W * side / box.width, H * side / box.height);
+const click = (row, col) => canvas.dispatchEvent(new MouseEvent("click", {
+  clientX: box.left + (col + 0.5) * side / scale, clientY: box.top + (row + 0.5) * side / scale}));
+const pixel = (row, col) => [...pen.getImageData((col + 0.5) * side, (row + 0.25) * side, 1, 1).data].slice(0, 3);
+said.push(status.textContent);
+click(data.paths[0][0][0], data.paths[0][0][1]);
+said.push(status.textContent);
+slider.value = last; slider.oninput();
+said.push(status.textContent);
+let clock = 0, wanted = [];
+performance.now = () => clock;
+window.requestAnimationFrame = (frame) => wanted.push(frame);
+const pass = (milliseconds) => {
+  for (const end = clock + milliseconds; clock < end;) {
+    clock += 20;
+    const frames = wanted;
+    wanted = [];
+    frames.forEach((frame) => frame(clock));
+  }
+};
+speed.value = 5;
+button.click();
+pass(1000);
+const played = state.time, frames = state.frames;
+button.click();
+pass(1000);
+document.body.dataset.said = JSON.stringify({said, played, frames, paused: state.time});
+}</script></body>"""
+
+STROKES = """
+<script>{
+let strokes = 0;
+for (const name of ["arc", "drawImage", "fillRect", "lineTo", "strokeRect"]) {
+  const draws = pen[name].bind(pen);
+  pen[name] = (...where) => { strokes++; draws(...where); };
+}
+state.time = 0.5; state.chosen = 0;
+draw();
+document.body.dataset.said = JSON.stringify({strokes});
+}</script></body>"""
+
+
+def browse(page: str, script: str, folder: Path) -> dict[str, object]:
+    path = folder / "page.html"
+    path.write_text(page.replace("</body>", script), encoding="utf-8")
+    command = [str(BROWSER), "--headless=new", "--no-sandbox", "--disable-gpu"]
+    command += [f"--user-data-dir={folder / 'profile'}", "--dump-dom", path.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    found = re.search('data-said="([^"]*)"', done.stdout)
+    assert found, done.stderr[-2000:]
+    return json.loads(found.group(1).replace("&quot;", '"'))
+
+
+@pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
+def test_the_page_plays_pauses_scrubs_and_tells_what_a_robot_knows(tmp_path: Path) -> None:
+    instance = Instance(np.zeros((4, 9), bool), [[0, 0], [0, 4], [3, 8]], [[0, 2], [0, 4], [3, 8]])
+    paths = np.repeat(instance.starts[None], 41, axis=0)
+    paths[20:, 0], paths[40:, 0] = (0, 1), (0, 2)
+    page = replay(instance, Solution(paths), config=EnvConfig(comm_radius=4.5))
+    told = browse(page, ACTIONS, tmp_path)
+    assert told["said"] == [
+        "step 0 of 40, 2 of 3 on goal",
+        "step 0 of 40, 2 of 3 on goal; robot 0 at (0,0), goal (0,2), hears 1",
+        "step 40 of 40, 3 of 3 on goal; robot 0 at (0,2), goal (0,2), hears 1",
+    ]
+    assert told["played"] == pytest.approx(5), "it has begun anew and plays five steps a second"
+    assert told["frames"] == 50
+    assert told["paused"] == told["played"]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
+def test_a_picture_costs_two_strokes_a_robot_whatever_the_map(tmp_path: Path) -> None:
+    instance = random_instance(height=60, width=60, num_agents=500, seed=0)
+    page = replay(instance, Solution(np.repeat(instance.starts[None], 30, axis=0)))
+    strokes = browse(page, STROKES, tmp_path)["strokes"]
+    assert isinstance(strokes, int)
+    assert 1000 < strokes < 1000 + 100, "a goal and a robot each, and what the chosen one knows"
+
+
+def test_the_page_is_self_contained_and_no_text_ends_its_script(tmp_path: Path) -> None:
+    instance = random_instance(num_agents=2, seed=0)
+    path = tmp_path / "page.html"
+    page = replay(instance, Solution(instance.starts[None]), path, title="</script><b>")
+    assert path.read_text(encoding="utf-8") == page
+    assert page.count("</script>") == 1
+    assert "http" not in page
+    with pytest.raises(ValueError, match="the solution has 1 paths, the instance 2 agents"):
+        replay(instance, Solution(np.zeros((1, 1, 2), int)))

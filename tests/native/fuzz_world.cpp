@@ -1,0 +1,123 @@
+// Random teams under all options of the native core, to be run with AddressSanitizer and UBSan:
+//   c++ -std=c++20 -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all -I. tests/native/fuzz_world.cpp
+//     mapf_env/native/graph.cpp mapf_env/native/generate.cpp -o fuzz_world && ./fuzz_world SECONDS
+// Every buffer has exactly the size that it needs, and every executed step is checked for conflicts.
+#include <chrono>
+#include <cstdio>
+#include <cstdlib>
+#include <memory>
+#include <set>
+#include <vector>
+
+#include "mapf_env/native/generate.hpp"
+#include "mapf_env/native/team_step.hpp"
+
+namespace {
+
+using namespace mapf;
+
+void require(bool holds, const char* what, std::uint64_t seed) {
+    if (holds) return;
+    std::printf("seed %llu: %s\n", static_cast<unsigned long long>(seed), what);
+    std::exit(1);
+}
+
+template <class T>
+void play(std::uint64_t seed) {
+    Random random(seed);
+    const int height = 1 + random.below(12), width = 2 + random.below(12), radius = 1 + random.below(6);
+    const auto style = static_cast<Style>(random.below(6));
+    const int obstacles = style == Style::cells ? random.below(height * width / 3 + 1) : 0;
+    const Grid grid = random_map(style, height, width, obstacles, random);
+    int free = 0;
+    for (const auto cell : grid.blocked) free += cell == 0;
+    if (free < 2) return;
+    const int n = 1 + random.below(std::min(free, 12));
+    const std::size_t N = n + random.below(3);
+
+    Teams<T> teams{};
+    teams.layout = {height, width, radius};
+    teams.num_envs = 1;
+    teams.num_agents = N;
+    const std::size_t size = teams.layout.size();
+    std::vector<T> map(size, T{1});
+    for (int row = 0; row < height; ++row)
+        for (int col = 0; col < width; ++col)
+            map[teams.layout.cell(row, col)] = static_cast<T>(grid.blocked[grid.layout.cell(row, col)]);
+    std::vector<std::int32_t> positions(2 * N), goals(2 * N), previous(2 * N), under_way(N), arrivals(N), regions(size, -1);
+    std::vector<std::int32_t> labels(static_cast<std::size_t>(height) * width);
+    place_agents(grid, n, random, positions.data(), goals.data());
+    previous = positions;
+    label_components(grid, labels.data());
+    for (int row = 0; row < height; ++row)
+        std::copy_n(labels.data() + row * width, width, regions.data() + teams.layout.cell(row, 0));
+    std::vector<Distance> distances(N * size), one;
+    std::vector<int> queue;
+    for (int i = 0; i < n; ++i) {
+        distances_to(grid_of(teams.layout, map.data()), teams.layout.cell(goals[2 * i], goals[2 * i + 1]), one, queue);
+        std::copy(one.begin(), one.end(), distances.begin() + i * size);
+    }
+
+    Options options;
+    options.fov_radius = radius;
+    options.pibt = random.below(2);
+    options.lifelong = random.below(2);
+    options.max_cycles = 1 + random.below(40);
+    options.weights = static_cast<Weights>(random.below(2));
+    options.message_loss = random.below(3) / 2.0;
+    for (int channel = 0; channel < 3; ++channel)
+        if (random.below(2)) options.extras.push_back(static_cast<Channel>(channel));
+    options.rewards = {1.0f, -1.0f, 0.5f, -0.5f, 3.0f, static_cast<float>(random.below(2))};
+
+    const std::int32_t team_size = n;
+    const std::uint64_t episode = seed;
+    const double comm_radius = connecting_radius(positions.data(), n, 0.5 + random.below(5));
+    std::int64_t time = 0;
+    bool ended = false, terminated = false, truncated = false;
+    std::vector<float> rewards(N), graph(N * N);
+    std::unique_ptr<bool[]> replaced(new bool[N]()), arrived(new bool[N]()), on_goal(new bool[N]());
+    std::vector<std::int8_t> mask(N * num_actions);
+    const std::size_t side = 2 * radius + 3;
+    std::vector<T> fov(N * (num_channels + options.extras.size()) * side * side);
+    teams.obstacles = map.data(), teams.team_sizes = &team_size, teams.seeds = &episode, teams.comm_radius = &comm_radius;
+    teams.regions = regions.data(), teams.positions = positions.data(), teams.goals = goals.data();
+    teams.previous = previous.data(), teams.under_way = under_way.data(), teams.arrivals = arrivals.data();
+    teams.distances = distances.data(), teams.times = &time, teams.ended = &ended, teams.rewards = rewards.data();
+    teams.terminated = &terminated, teams.truncated = &truncated, teams.replaced = replaced.get();
+    teams.arrived = arrived.get(), teams.on_goal = on_goal.get(), teams.action_mask = mask.data();
+
+    TeamScratch<T> scratch(teams.layout, static_cast<int>(N));
+    std::vector<std::int64_t> actions(N);
+    std::vector<float> values(N * num_actions);
+    while (!ended) {
+        for (auto& action : actions) action = random.below(num_actions);
+        for (auto& value : values) value = static_cast<float>(random.below(7));
+        const bool by_values = options.pibt && random.below(2);
+        step_team(teams, options, 0, {actions.data(), by_values ? values.data() : nullptr}, scratch);
+        perceive(teams, options, 0, scratch, fov.data(), graph.data());
+        write_action_mask(teams, 0);
+        std::set<int> cells;
+        std::set<std::pair<int, int>> moves;
+        for (int i = 0; i < n; ++i) {
+            const int from = teams.layout.cell(previous[2 * i], previous[2 * i + 1]);
+            const int to = teams.layout.cell(positions[2 * i], positions[2 * i + 1]);
+            require(teams.layout.contains(positions[2 * i], positions[2 * i + 1]), "a robot left the map", seed);
+            require(map[to] == T{0}, "a robot entered an obstacle", seed);
+            require(cells.insert(to).second, "two robots in one cell", seed);
+            require(from == to || moves.count({to, from}) == 0, "two robots exchanged cells", seed);
+            moves.insert({from, to});
+        }
+        for (const T mark : scratch.marks) require(mark == T{0}, "marks were left", seed);
+    }
+}
+
+}  // namespace
+
+int main(int count, char** values) {
+    const double seconds = count > 1 ? std::atof(values[1]) : 10.0;
+    const auto began = std::chrono::steady_clock::now();
+    std::uint64_t seed = 0;
+    for (; std::chrono::duration<double>(std::chrono::steady_clock::now() - began).count() < seconds; ++seed)
+        seed % 2 ? play<float>(seed) : play<std::uint8_t>(seed);
+    std::printf("%llu episodes without a fault\n", static_cast<unsigned long long>(seed));
+}
