@@ -1,0 +1,25 @@
+"""The teachers: solvers that take an instance and give a solution."""
+
+from experts.ecbs import solve
+from experts.lazy_constraints import lacam
+from experts.many import Solver, solve_many, solve_stream
+from experts.paths import load_paths, save_paths
+from experts.prioritised_planning import prioritised
+from experts.priority_inheritance import pibt
+from experts.relabelling import relabel
+from experts.result import Result, Status
+
+__all__ = [
+    "Result",
+    "Solver",
+    "Status",
+    "lacam",
+    "load_paths",
+    "pibt",
+    "prioritised",
+    "relabel",
+    "save_paths",
+    "solve",
+    "solve_many",
+    "solve_stream",
+]

@@ -1,0 +1,155 @@
+"""Solve a scenario, or check a file of paths, from a shell."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from experts import arguments
+from experts.many import SOLVER_NAMES, solver_named
+from experts.paths import load_paths, save_paths
+from mapf_env import animate, load_map, load_scen, random_instance
+from mapf_env.instance import Instance
+
+_EXIT_CODES = """exit status: 0 solved or valid, 1 not solved or invalid, 2 an error in the arguments or a file"""
+_MOST_VIOLATIONS = 20
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line on standard error instead of the whole usage."""
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def main(arguments_given: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments_given)
+    try:
+        return options.run(options)
+    except (ValueError, TypeError, OSError) as error:
+        print(f"python -m experts: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("python -m experts: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> _Parser:
+    parser = _Parser(prog="python -m experts", description=__doc__, epilog=_EXIT_CODES)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+
+    solve = commands.add_parser(
+        "solve",
+        help="solve a scenario",
+        description="Solve the first robots of a MovingAI scenario, or robots placed at random on a map, and print "
+        "cost, bound and time.",
+        epilog=_EXIT_CODES,
+    )
+    _add_problem(solve, "problem")
+    solve.add_argument("--solver", choices=SOLVER_NAMES, default="ecbs", help="default: ecbs")
+    solve.add_argument(
+        "--w",
+        type=float,
+        default=arguments.DEFAULT_W,
+        help=f"of ecbs: how much the cost may exceed the optimum, at least 1 (default: {arguments.DEFAULT_W})",
+    )
+    solve.add_argument(
+        "--time-limit",
+        type=float,
+        default=arguments.DEFAULT_TIME_LIMIT,
+        metavar="SECONDS",
+        help=f"default: {arguments.DEFAULT_TIME_LIMIT:g}",
+    )
+    solve.add_argument(
+        "--node-limit",
+        type=int,
+        default=arguments.DEFAULT_NODE_LIMIT,
+        metavar="NODES",
+        help=f"of ecbs and lacam: nodes to generate at most (default: {arguments.DEFAULT_NODE_LIMIT})",
+    )
+    solve.add_argument("--paths", metavar="OUT", help="write the paths to this file, a line for each robot")
+    solve.add_argument("--animation", metavar="OUT.svg", help="write an animation of the plan to this file")
+    solve.set_defaults(run=_solve)
+
+    check = commands.add_parser(
+        "check",
+        help="check a file of paths",
+        description="Check that the paths of a file solve a scenario: all begin at their starts, end on their goals, "
+        "move a cell at a time over free cells, and no two robots meet or swap.",
+        epilog=_EXIT_CODES,
+    )
+    check.add_argument("paths", metavar="PATHS", help="the file of paths, as `solve --paths` writes it")
+    _add_problem(check, "--scen")
+    check.set_defaults(run=_check)
+    return parser
+
+
+def _add_problem(parser: argparse.ArgumentParser, name: str) -> None:
+    action = parser.add_argument(
+        name,
+        metavar="FILE",
+        help="a scenario (.scen), whose map is looked for beside it, or a map (.map) for random robots",
+    )
+    action.required = True
+    parser.add_argument("--map", metavar="FILE.map", help="the map of the scenario, if it lies elsewhere")
+    parser.add_argument("--agents", type=int, metavar="N", help="the number of robots (default: all of the scenario)")
+    parser.add_argument("--seed", type=int, default=0, help="of random robots and of the solver (default: 0)")
+
+
+def _load(file: str, options: argparse.Namespace, num_agents: int | None) -> Instance:
+    if Path(file).suffix != ".map":
+        return load_scen(file, num_agents, options.map)
+    if options.map is not None:
+        raise ValueError("--map goes with a scenario only: the map is given already")
+    if num_agents is None:
+        raise ValueError("robots on a map are placed at random: give --agents N (and --seed S)")
+    return random_instance(grid=load_map(file), num_agents=num_agents, seed=options.seed)
+
+
+def _solve(options: argparse.Namespace) -> int:
+    instance = _load(options.problem, options, options.agents)
+    solver = solver_named(
+        options.solver,
+        w=options.w,
+        time_limit=options.time_limit,
+        node_limit=options.node_limit,
+        seed=options.seed,
+    )
+    result = solver(instance)
+    print(f"status       {result.status}")
+    if result.solution is not None:
+        print(f"cost         {result.cost}")
+    print(f"lower bound  {result.lower_bound}")
+    if result.cost and result.lower_bound:
+        print(f"ratio        {result.cost / result.lower_bound:.4f}")
+    if result.solution is not None:
+        print(f"makespan     {result.solution.makespan}")
+    print(f"expansions   {result.expansions}")
+    print(f"seconds      {result.seconds:.6f}")
+    if result.solution is None:
+        return 1
+    if options.paths is not None:
+        save_paths(options.paths, result.solution)
+    if options.animation is not None:
+        title = f"{options.solver}, {instance.num_agents} robots, cost {result.cost}"
+        animate(instance, result.solution, options.animation, title=title)
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    solution = load_paths(options.paths)
+    found = solution.paths.shape[1]
+    instance = _load(options.scen, options, found if options.agents is None else options.agents)
+    violations = solution.violations(instance)
+    for violation in violations[:_MOST_VIOLATIONS]:
+        print(violation)
+    if len(violations) > _MOST_VIOLATIONS:
+        print(f"and {len(violations) - _MOST_VIOLATIONS} more")
+    if violations:
+        print(f"invalid: {len(violations)} violations")
+        return 1
+    print(f"valid: {found} robots, cost {solution.sum_of_costs}, makespan {solution.makespan}")
+    return 0

@@ -1,0 +1,52 @@
+"""LaCAM: plans for hundreds to thousands of robots, complete, quick, and better the longer it may take."""
+
+from __future__ import annotations
+
+import math
+
+from experts import _native, arguments
+from experts.result import Result, as_result
+from mapf_env.instance import Instance
+
+
+def lacam(
+    instance: Instance,
+    *,
+    w: float = math.inf,
+    time_limit: float = arguments.DEFAULT_TIME_LIMIT,
+    node_limit: int = arguments.DEFAULT_NODE_LIMIT,
+    seed: int = 0,
+) -> Result:
+    """Finds a plan by lazy constraints addition search, and improves it if that is asked for.
+
+    Okumura 2023, "LaCAM: search-based algorithm for quick multi-agent pathfinding": a depth-first search over joint
+    states whose successors PIBT makes, complete because all constraints on a successor are tried in the end. A plan is
+    then improved by large neighbourhood search (Li et al. 2021; Okumura 2024, "Engineering LaCAM*") until it costs at
+    most `w` times the sum of the distances, or time is up.
+
+    Args:
+        instance: The problem.
+        w: Where improvement stops, at least 1; by default the first plan is returned as it is.
+        time_limit: Seconds of wall-clock time, `math.inf` for none. A plan found earlier is returned.
+        node_limit: Joint states to generate at most; this bounds the memory (about 8 bytes a robot and state).
+        seed: Draws the order of equally good moves and of constraints.
+
+    Returns:
+        The result. Its lower bound is the sum of the distances. `infeasible` is a proof: all joint states were seen.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+        TypeError: If an argument has the wrong type.
+        KeyboardInterrupt: At Ctrl-C.
+    """
+    arguments.require_instance(instance, "instance")
+    parts = _native.lacam(
+        instance.grid,
+        instance.starts,
+        instance.goals,
+        w if w == math.inf else arguments.suboptimality(w),
+        arguments.seconds(time_limit),
+        arguments.at_least_one(node_limit, "node_limit"),
+        arguments.seed_number(seed),
+    )
+    return as_result(parts)

@@ -1,0 +1,192 @@
+"""Many instances: as a list, or as a stream that never holds more than a few at once."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from itertools import islice
+
+from experts import arguments
+from experts.ecbs import solve, solve_batch
+from experts.lazy_constraints import lacam
+from experts.prioritised_planning import prioritised
+from experts.priority_inheritance import pibt
+from experts.result import Result
+from mapf_env.instance import Instance
+
+Solver = Callable[[Instance], Result]
+"""What a solver is: an instance in, a result out. Your own is one such function; `Result.of` makes its results."""
+
+Progress = Callable[[int, int], None]
+"""Told after each result: how many instances are done, and how many of them are solved."""
+
+SOLVER_NAMES = ("ecbs", "lacam", "prioritised", "pibt")
+
+
+def solve_many(
+    instances: Iterable[Instance],
+    *,
+    solver: str | Solver = "ecbs",
+    w: float = arguments.DEFAULT_W,
+    threads: int = 1,
+    time_limit: float = arguments.DEFAULT_TIME_LIMIT,
+    node_limit: int = arguments.DEFAULT_NODE_LIMIT,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[Result]:
+    """Solves each instance as `solve` does, or by another solver, over `threads` threads.
+
+    Instances may differ in maps and numbers of robots. The limits are those of each instance, not of the call. The
+    results do not depend on the number of threads (but for time limits), and each is what the solver alone gives.
+
+    Args:
+        instances: The problems.
+        solver: `"ecbs"`, `"lacam"`, `"prioritised"`, `"pibt"`, or a function of an instance, as `functools.partial`
+            makes one that fixes more options.
+        w: As in `solve`; `"ecbs"` alone takes it.
+        threads: Native solvers do not hold Python's interpreter lock. A function runs in a pool of threads, or in the
+            calling thread if there is one only.
+        time_limit: Seconds for each instance, where a named solver takes a limit.
+        node_limit: For each instance, where a named solver takes a limit.
+        seed: Of named solvers.
+        progress: Called after each result with the number of instances done and of those solved.
+
+    Returns:
+        One result for each instance, in their order; unsolved ones say why.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+        TypeError: If an argument has the wrong type, an element of `instances` is no `Instance`, or a solver's answer
+            no `Result`.
+        KeyboardInterrupt: At Ctrl-C, which stops ECBS at once; of other solvers those that are running finish first.
+    """
+    problems = arguments.all_instances(instances)
+    return list(
+        solve_stream(
+            problems,
+            solver=solver,
+            w=w,
+            threads=threads,
+            time_limit=time_limit,
+            node_limit=node_limit,
+            seed=seed,
+            backlog=max(1, len(problems)),
+            progress=progress,
+        )
+    )
+
+
+def solve_stream(
+    instances: Iterable[Instance],
+    *,
+    solver: str | Solver = "ecbs",
+    w: float = arguments.DEFAULT_W,
+    threads: int = 1,
+    time_limit: float = arguments.DEFAULT_TIME_LIMIT,
+    node_limit: int = arguments.DEFAULT_NODE_LIMIT,
+    seed: int = 0,
+    backlog: int = arguments.DEFAULT_BACKLOG,
+    progress: Progress | None = None,
+) -> Iterator[Result]:
+    """Solves instances as they come: `solve_many` for more of them than fit into memory, or without an end.
+
+    No more than `backlog` instances are taken before their results are: whoever reads slowly slows the source down.
+    Arguments are checked in this call, before the first result is asked for.
+
+    Args:
+        instances: The problems; taken from the calling thread only, so any generator will do.
+        solver: As in `solve_many`, like all arguments but the next.
+        w: As in `solve_many`.
+        threads: As in `solve_many`.
+        time_limit: As in `solve_many`.
+        node_limit: As in `solve_many`.
+        seed: As in `solve_many`.
+        backlog: Instances to hold at most. ECBS solves so many at a time.
+        progress: As in `solve_many`.
+
+    Returns:
+        An iterator over one result for each instance, in their order; unsolved ones say why.
+
+    Raises:
+        ValueError: As `solve_many`.
+        TypeError: As `solve_many`.
+    """
+    limits = {
+        "time_limit": arguments.seconds(time_limit),
+        "node_limit": arguments.at_least_one(node_limit, "node_limit"),
+        "seed": arguments.seed_number(seed),
+    }
+    arguments.suboptimality(w)
+    threads = arguments.at_least_one(threads, "threads", maximum=arguments.MAX_THREADS)
+    backlog = arguments.at_least_one(backlog, "backlog")
+    if solver == "ecbs":
+        batch = partial(solve_batch, w=w, threads=threads, **limits)
+        results = _in_batches(_checked(instances), batch, backlog)
+    else:
+        single = solver_named(solver, w=w, **limits) if isinstance(solver, str) else solver
+        if not callable(single):
+            raise TypeError(f"solver must be one of {', '.join(SOLVER_NAMES)} or a function, got {solver!r}")
+        results = _in_pool(_checked(instances), single, threads, backlog)
+    return results if progress is None else _reporting(results, progress)
+
+
+def solver_named(name: str, *, w: float, time_limit: float, node_limit: int, seed: int) -> Solver:
+    """The solver of that name with the options it takes; raises ValueError if there is none."""
+    match name:
+        case "ecbs":
+            return partial(solve, w=w, time_limit=time_limit, node_limit=node_limit, seed=seed)
+        case "lacam":
+            return partial(lacam, time_limit=time_limit, node_limit=node_limit, seed=seed)
+        case "prioritised":
+            return partial(prioritised, time_limit=time_limit, seed=seed)
+        case "pibt":
+            return partial(pibt, seed=seed)
+    raise ValueError(f"solver must be one of {', '.join(SOLVER_NAMES)} or a function, got {name!r}")
+
+
+def _checked(instances: Iterable[Instance]) -> Iterator[Instance]:
+    for index, instance in enumerate(instances):
+        arguments.require_instance(instance, f"instances[{index}]")
+        yield instance
+
+
+def _in_batches(
+    instances: Iterator[Instance], batch: Callable[[list[Instance]], list[Result]], size: int
+) -> Iterator[Result]:
+    while taken := list(islice(instances, size)):
+        yield from batch(taken)
+
+
+def _in_pool(instances: Iterator[Instance], solver: Solver, threads: int, backlog: int) -> Iterator[Result]:
+    if threads == 1:
+        for instance in instances:
+            yield _answer(solver, instance)
+        return
+    pool = ThreadPoolExecutor(threads)
+    try:
+        waiting: deque[Future[Result]] = deque()
+        while True:
+            for instance in islice(instances, backlog - len(waiting)):
+                waiting.append(pool.submit(_answer, solver, instance))
+            if not waiting:
+                return
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _answer(solver: Solver, instance: Instance) -> Result:
+    result = solver(instance)
+    if not isinstance(result, Result):
+        raise TypeError(f"a solver must return an experts.Result, got {type(result).__name__} (see Result.of)")
+    return result
+
+
+def _reporting(results: Iterator[Result], progress: Progress) -> Iterator[Result]:
+    solved = 0
+    for done, result in enumerate(results, start=1):
+        solved += result.solved
+        progress(done, solved)
+        yield result

@@ -1,0 +1,91 @@
+// Which moves bring a robot closer to its goal, found only as far as it is asked for: for large maps and many robots.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <cstdlib>
+#include <utility>
+#include <vector>
+
+#include "mapf_env/native/grid.hpp"
+
+namespace mapf {
+
+// Reverse resumable A* (Silver 2005, "Cooperative pathfinding") from the goal towards the start. The Manhattan distance
+// to the start changes by one with every move, so open cells have one of two estimates, and two stacks take the place
+// of a heap. Neighbours' distances differ by exactly one, so distances modulo three tell which is closer: two bits a
+// cell.
+class Guidance {
+public:
+    Guidance(const Grid& grid, int start, int goal)
+        : grid_(&grid), steps_(grid.layout.steps()), thorough_(grid.blocked.size() < large_map),
+          residues_(grid.blocked.size() / cells_in_byte + 1, 0) {
+        const auto& layout = grid.layout;
+        const int rows = layout.row(goal) - layout.row(start), cols = layout.col(goal) - layout.col(start);
+        estimate_ = std::abs(rows) + std::abs(cols);
+        now_.push_back({goal, static_cast<std::int16_t>(rows), static_cast<std::int16_t>(cols)});
+        search(start);
+        distance_ = estimate_;
+    }
+
+    // Steps from the start to the goal.
+    int distance() const { return distance_; }
+
+    // By how much the robot is further from its goal in `next` than in its neighbour `cell`: -1 or 1. Neither may be
+    // an obstacle. On large maps, of several shortest ways only one or a few are found, and the others count as longer.
+    int detour(int cell, int next) {
+        if (residue(cell) == unknown) search(cell);
+        if (residue(next) == unknown) {
+            if (!thorough_) return 1;
+            search(next);
+        }
+        return (residue(next) - residue(cell) + 3) % 3 == 1 ? 1 : -1;
+    }
+
+private:
+    static constexpr std::size_t cells_in_byte = 4;
+    static constexpr int unknown = 0;
+    static constexpr std::size_t large_map = 128 * 128;
+
+    struct Open {
+        int cell;
+        std::int16_t rows, cols;  // below and right of the start
+    };
+
+    int residue(int cell) const {
+        return residues_[static_cast<std::size_t>(cell) / cells_in_byte] >> 2 * (cell % 4) & 3;
+    }
+
+    void search(int cell) {
+        while (residue(cell) == unknown) {
+            if (now_.empty()) {
+                if (later_.empty()) return;
+                std::swap(now_, later_);
+                estimate_ += 2;
+            }
+            const auto here = now_.back();
+            now_.pop_back();
+            if (residue(here.cell) != unknown) continue;
+            const int found = estimate_ - std::abs(here.rows) - std::abs(here.cols);
+            residues_[static_cast<std::size_t>(here.cell) / cells_in_byte] |=
+                static_cast<std::uint8_t>((1 + found % 3) << 2 * (here.cell % 4));
+            const std::array<bool, idle> nearer{here.rows > 0, here.cols > 0, here.rows < 0, here.cols < 0};
+            for (int action = 0; action < idle; ++action) {
+                const int next = here.cell + steps_[action];
+                if (grid_->blocked[next] || residue(next) != unknown) continue;
+                (nearer[action] ? now_ : later_)
+                    .push_back({next, static_cast<std::int16_t>(here.rows + row_step[action]),
+                                static_cast<std::int16_t>(here.cols + col_step[action])});
+            }
+        }
+    }
+
+    const Grid* grid_;
+    std::array<int, num_actions> steps_;
+    bool thorough_;
+    std::vector<std::uint8_t> residues_;  // 1 + the distance modulo 3
+    std::vector<Open> now_, later_;       // with the lowest estimate, and with the next
+    int estimate_ = 0, distance_ = 0;
+};
+
+}  // namespace mapf

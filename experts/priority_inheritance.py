@@ -1,0 +1,39 @@
+"""PIBT: a rule-based planner, fast and without a bound, the baseline that learns nothing and knows the whole map."""
+
+from __future__ import annotations
+
+from experts import _native, arguments
+from experts.result import Result, as_result
+from mapf_env.instance import Instance
+
+
+def pibt(instance: Instance, *, max_steps: int = arguments.DEFAULT_MAX_STEPS, seed: int = 0) -> Result:
+    """Moves all robots step by step by priority inheritance with backtracking until all are on their goals at once.
+
+    Okumura, Machida, Defago and Tamura 2022, "Priority inheritance with backtracking for iterative multi-agent path
+    finding". In each step a robot takes the free neighbour cell closest to its goal, and pushes out of its way whoever
+    has less priority; robots that have been under way for longest come first. Plans have no conflicts. On graphs whose
+    cells all lie on cycles every robot reaches its goal some time, but not all of them need to rest there at once.
+
+    Args:
+        instance: The problem.
+        max_steps: Joint steps after which to give up with the status `step_limit`.
+        seed: Draws the first order of priorities and the order of equally good cells.
+
+    Returns:
+        The result. Its lower bound is the sum of the distances, its expansions are the joint steps.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+        TypeError: If an argument has the wrong type.
+        KeyboardInterrupt: At Ctrl-C.
+    """
+    arguments.require_instance(instance, "instance")
+    parts = _native.pibt(
+        instance.grid,
+        instance.starts,
+        instance.goals,
+        arguments.at_least_one(max_steps, "max_steps", maximum=arguments.MAX_STEPS),
+        arguments.seed_number(seed),
+    )
+    return as_result(parts)

@@ -1,0 +1,68 @@
+"""What a solver answers: a solution with its proof of quality, or the reason why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from mapf_env.solution import Solution
+
+
+class Status(StrEnum):
+    """How a search ended."""
+
+    SOLVED = "solved"
+    NODE_LIMIT = "node_limit"
+    TIME_LIMIT = "time_limit"
+    INFEASIBLE = "infeasible"
+    STEP_LIMIT = "step_limit"
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The outcome of one search.
+
+    Attributes:
+        status: How the search ended; `infeasible` is a proof that there is no solution.
+        solution: The paths if solved, else None.
+        cost: The sum of costs of the solution in steps, or None without one.
+        lower_bound: No solution costs less; proved by the search as far as it got.
+        expansions: High-level nodes expanded (PIBT: joint steps; prioritised planning: orders tried).
+        generated: High-level nodes generated, the same way.
+        seconds: Wall-clock time of the search, distance tables included.
+    """
+
+    status: Status
+    solution: Solution | None
+    cost: int | None
+    lower_bound: int
+    expansions: int
+    generated: int
+    seconds: float
+
+    @classmethod
+    def of(cls, solution: Solution, *, lower_bound: int = 0, seconds: float = 0.0) -> Result:
+        """What a solver of your own answers: a solution, and the lower bound it has proved, if any."""
+        return cls(Status.SOLVED, solution, solution.sum_of_costs, lower_bound, 0, 0, seconds)
+
+    @property
+    def solved(self) -> bool:
+        """Whether there is a solution."""
+        return self.solution is not None
+
+
+_STATUSES = tuple(Status)  # the native enumeration has the same order
+
+Parts = tuple[int, npt.NDArray[np.int32] | None, int, int, int, int, float]
+"""A result as the native solvers give it: status number, paths, cost, bound, expansions, generated, seconds."""
+
+
+def as_result(parts: Parts) -> Result:
+    """The result made of native parts."""
+    status, paths, cost, lower_bound, expansions, generated, seconds = parts
+    solution = None if paths is None else Solution(paths)
+    paid = None if paths is None else cost
+    return Result(_STATUSES[status], solution, paid, lower_bound, expansions, generated, seconds)

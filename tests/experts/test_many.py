@@ -1,0 +1,81 @@
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+import pytest
+
+import experts
+from experts import Result, Status
+from mapf_env import Instance, Solution, random_instance
+
+INSTANCES = [random_instance(num_agents=8, seed=seed) for seed in range(30)]
+IMPOSSIBLE = Instance(np.zeros((1, 3), bool), [(0, 0), (0, 2)], [(0, 2), (0, 0)])
+
+
+def costs(results: list[Result]) -> list[int | None]:
+    return [result.cost for result in results]
+
+
+def test_a_stream_is_the_list() -> None:
+    expected = costs([experts.solve(instance) for instance in INSTANCES])
+    assert costs(experts.solve_many(INSTANCES, threads=2)) == expected
+    for threads in (1, 2):
+        for backlog in (1, 7, 64):
+            stream = experts.solve_stream(iter(INSTANCES), threads=threads, backlog=backlog)
+            assert costs(list(stream)) == expected
+
+
+@pytest.mark.parametrize("solver", ["ecbs", "lacam", partial(experts.lacam, seed=0)])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_slow_reader_holds_the_source_back(solver: experts.Solver | str, threads: int) -> None:
+    taken = 0
+
+    def endless() -> Iterator[Instance]:
+        nonlocal taken
+        while True:
+            taken += 1
+            yield INSTANCES[taken % len(INSTANCES)]
+
+    stream = experts.solve_stream(endless(), solver=solver, threads=threads, backlog=4)
+    for read in range(1, 12):
+        assert next(stream).solved
+        assert taken <= read + 4
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_solvers_of_all_kinds(threads: int) -> None:
+    for name, alone in (("lacam", experts.lacam), ("prioritised", experts.prioritised), ("pibt", experts.pibt)):
+        expected = costs([alone(instance) for instance in INSTANCES])
+        assert costs(experts.solve_many(INSTANCES, solver=name, threads=threads)) == expected
+        assert costs(experts.solve_many(INSTANCES, solver=alone, threads=threads)) == expected
+
+
+def test_a_solver_of_your_own() -> None:
+    def stay(instance: Instance) -> Result:
+        return Result.of(Solution(instance.starts[None]), lower_bound=0)
+
+    home = Instance(np.zeros((2, 2), bool), [(0, 0)], [(0, 0)])
+    (result,) = experts.solve_many([home], solver=stay)
+    assert (result.status, result.cost, result.solved) == (Status.SOLVED, 0, True)
+    for threads in (1, 2):
+        with pytest.raises(TypeError, match=r"must return an experts.Result, got NoneType"):
+            experts.solve_many([home], solver=lambda _: None, threads=threads)  # pyright: ignore[reportArgumentType]
+
+
+def test_unsolved_cases_are_reported_and_progress_is_told() -> None:
+    told: list[tuple[int, int]] = []
+    mixed = [INSTANCES[0], IMPOSSIBLE, INSTANCES[1]]
+    results = experts.solve_many(mixed, threads=2, progress=lambda done, solved: told.append((done, solved)))
+    assert [result.status for result in results] == [Status.SOLVED, Status.INFEASIBLE, Status.SOLVED]
+    assert told == [(1, 1), (2, 1), (3, 2)]
+
+
+def test_arguments_are_checked_before_the_first_result() -> None:
+    with pytest.raises(ValueError, match="solver must be one of ecbs, lacam, prioritised, pibt"):
+        experts.solve_stream(INSTANCES, solver="best")
+    with pytest.raises(TypeError, match="solver must be one of"):
+        experts.solve_stream(INSTANCES, solver=3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="backlog"):
+        experts.solve_stream(INSTANCES, backlog=0)
+    with pytest.raises(TypeError, match=r"instances\[1\] must be a mapf_env.Instance"):
+        list(experts.solve_stream([INSTANCES[0], 7], solver="pibt"))  # pyright: ignore[reportArgumentType]
