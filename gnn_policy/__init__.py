@@ -1,0 +1,24 @@
+"""The pupil: a CNN-GNN policy that imitates an expert, its training loop and its evaluation."""
+
+try:
+    import torchrl  # noqa: F401
+except ImportError as missing:
+    raise ImportError(
+        f'gnn_policy needs the extra "train" ({missing}): '
+        'pip install "mapf-env[train]", or in a checkout pip install ".[train]"'
+    ) from None
+
+from gnn_policy.checkpoint import load, save
+from gnn_policy.network import DecentralizedPolicy, GraphFilter, PolicyConfig, shift_operator
+from gnn_policy.rollout import Rollouts, rollout
+
+__all__ = [
+    "DecentralizedPolicy",
+    "GraphFilter",
+    "PolicyConfig",
+    "Rollouts",
+    "load",
+    "rollout",
+    "save",
+    "shift_operator",
+]

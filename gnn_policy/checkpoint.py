@@ -1,0 +1,84 @@
+"""Policies on disk: one safetensors file that carries its own configuration."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import safetensors
+import safetensors.torch
+import torch
+
+from gnn_policy.network import DecentralizedPolicy, PolicyConfig
+from mapf_env.files import PathLike, replacing
+
+FORMAT = "mapf-env policy 1"
+PACKAGED = Path(__file__).with_name("weights") / "n10.safetensors"
+"""The policy that comes with the package; its card is weights/README.md."""
+
+
+class CheckpointError(ValueError):
+    """A file that is no policy of this package; the message says which and why."""
+
+
+def save(policy: DecentralizedPolicy, path: PathLike, **about: str) -> None:
+    """Write the weights and the configuration of `policy` to one file, replacing it as a whole or not at all.
+
+    Args:
+        policy: The policy.
+        path: A file, by convention ending in `.safetensors`.
+        about: Notes that travel with the weights, as the command that trained them.
+    """
+    metadata = {**about, "format": FORMAT, "policy": json.dumps(asdict(policy.config))}
+    weights = {name: tensor.contiguous() for name, tensor in policy.state_dict().items()}
+    with replacing(path) as draft:
+        draft.write_bytes(safetensors.torch.save(weights, metadata))
+
+
+def load(path: PathLike = PACKAGED) -> DecentralizedPolicy:
+    """The policy stored at `path`, in evaluation mode: a file, or a run folder of `gnn_policy.train`.
+
+    Without a path, the policy that comes with the package.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        CheckpointError: If the file is damaged, of another program or of another architecture.
+    """
+    metadata, weights = _read(path)
+    try:
+        policy = DecentralizedPolicy(PolicyConfig(**json.loads(metadata["policy"])))
+        policy.load_state_dict(weights)
+    except (KeyError, TypeError, ValueError, RuntimeError) as mismatch:
+        why = " ".join(f"{type(mismatch).__name__}: {mismatch}".split())
+        raise CheckpointError(f"the weights in {_file(path)} do not fit their configuration ({why})") from None
+    return policy.eval()
+
+
+def about(path: PathLike) -> dict[str, str]:
+    """The notes that were saved with the policy at `path`; raises as `load` does."""
+    return _read(path)[0]
+
+
+def _file(path: PathLike) -> Path:
+    return Path(path, "best.safetensors") if Path(path).is_dir() else Path(path)
+
+
+def _read(path: PathLike) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    file = _file(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"there is no checkpoint {file}: give a .safetensors file or a run folder of training")
+    try:
+        with safetensors.safe_open(file, "pt") as stored:
+            metadata: dict[str, str] = stored.metadata() or {}
+        weights = safetensors.torch.load_file(file)
+    except safetensors.SafetensorError as damage:
+        raise CheckpointError(
+            f"{file} is damaged or no safetensors file ({damage}): restore or train it anew"
+        ) from None
+    if metadata.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{file} is no policy of this package (format {metadata.get('format')!r}, expected {FORMAT!r}): "
+            "give a file that gnn_policy.save wrote"
+        )
+    return metadata, weights

@@ -1,0 +1,32 @@
+"""What the commands share: a user's mistake is answered in one line, and threads are counted."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+MAX_THREADS = 1024
+
+
+@contextmanager
+def mistakes_in_one_line() -> Iterator[None]:
+    """Answer what bad options and files raise by one line on stderr and exit status 2, Ctrl-C by one and 130."""
+    try:
+        yield
+    except (ValueError, FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as mistake:
+        print(f"error: {mistake}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def cpu_threads(asked: int) -> int:
+    """`asked`, or for 0 as many threads as the process may use."""
+    if not 0 <= asked <= MAX_THREADS:
+        raise ValueError(f"threads must lie in 0..{MAX_THREADS}, got {asked}")
+    if asked > 0:
+        return asked
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

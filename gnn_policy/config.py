@@ -1,0 +1,174 @@
+"""Every setting of training, each default written once."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from gnn_policy.network import PolicyConfig
+from mapf_env.files import write_whole
+from mapf_env.generation import MapStyle
+
+Recipe = Literal["quick", "paper"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainConfig:
+    """The settings of a training run; as written here they are those of the paper's setup section."""
+
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    """The network and what it perceives."""
+
+    num_agents: int = 10
+    """Robots N in a training team."""
+    height: int = 20
+    """Rows of a map."""
+    width: int = 20
+    """Columns of a map."""
+    density: float = 0.1
+    """Share of obstacles on a map."""
+    style: MapStyle = "cells"
+    """Obstacles: independent "cells", or short "walls" as the paper's released generator makes them."""
+    train_maps: int = 420
+    """Maps for training."""
+    validation_maps: int = 90
+    """Maps for the selection of the best checkpoint."""
+    test_maps: int = 90
+    """Maps for the final table."""
+    cases_per_map: int = 50
+    """Cases on each training and test map."""
+    validation_cases_per_map: int = 50
+    """Cases on each validation map."""
+    timeout: float = 3.0
+    """T_max in makespans of the expert's solution."""
+
+    w: float = 1.05
+    """The expert's cost is at most w times the lower bound of the optimum."""
+    expert_nodes: int = 2000
+    """High-level nodes that the expert may expand to label a state; unlabelled states are counted and left out."""
+
+    epochs: int = 150
+    """Rounds of collecting and fitting; round 0 imitates the expert, the others aggregate what the policy visits."""
+    updates_per_epoch: int | None = None
+    """Gradient steps in a round; without a number, one pass in which every demonstrated state is seen once."""
+    batch_size: int = 64
+    """Team states in a gradient step."""
+    demonstration_steps: int = 524_288
+    """Team steps played in round 0, by the expert."""
+    dagger_every: int = 4
+    """Rounds from one aggregation to the next; 0 for plain imitation."""
+    dagger_steps: int = 32_768
+    """Team steps played in each aggregation."""
+    beta_decay: float = 0.0
+    """In round r a team step follows the expert with probability beta_decay ** r (DAgger's beta), else the policy."""
+    fresh_share: float = 0.5
+    """With a number of steps: share of a batch drawn from the newest states; the rest comes from all of them."""
+    fresh_window: int = 65_536
+    """How many states count as the newest."""
+    rollout_length: int = 64
+    """Steps that a team plays in a round."""
+    rollout_teams: int = 128
+    """Teams that play side by side."""
+    sample_rollouts: bool = False
+    """Draw the moves of aggregated rollouts from the softmax in place of the most probable ones."""
+    augment: bool = False
+    """Turn and reflect every demonstrated state at random."""
+
+    lr: float = 1e-3
+    """Adam's first learning rate."""
+    final_lr: float = 1e-6
+    """The learning rate at the end of the cosine decay."""
+    beta1: float = 0.9
+    """Adam's momentum."""
+    weight_decay: float = 1e-5
+    """L2 regularisation."""
+
+    validate_every: int = 5
+    """Rounds from one validation to the next."""
+    seed: int = 0
+    """Of the weights, batches and rollouts."""
+    data_seed: int = 0
+    """Of the maps and cases of all three splits."""
+    threads: int = 0
+    """CPU threads; 0 takes all that the process may use."""
+    device: str = "cpu"
+    """Where the network lives."""
+
+    def __post_init__(self) -> None:
+        positive = (
+            "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
+            "expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
+            "rollout_teams lr final_lr validate_every"
+        )
+        for name in positive.split():
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        for name in ("dagger_every", "weight_decay", "seed", "data_seed", "threads"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("beta_decay", "fresh_share", "beta1"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
+        for name in ("seed", "data_seed"):
+            if getattr(self, name) >= 2**64:
+                raise ValueError(f"{name} must be below 2**64, got {getattr(self, name)}")
+        if not 1 <= self.w < math.inf:
+            raise ValueError(f"w must be at least 1 and finite, got {self.w}")
+        if self.updates_per_epoch is not None and self.updates_per_epoch < 1:
+            raise ValueError(f"updates_per_epoch must be at least 1, got {self.updates_per_epoch}")
+
+    def save(self, path: Path) -> None:
+        """Write the settings as JSON."""
+        write_whole(path, self.to_json())
+
+    @staticmethod
+    def load(path: Path) -> TrainConfig:
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: If the file is damaged or has settings that this version does not know.
+        """
+        try:
+            return TrainConfig.from_json(path.read_text())
+        except ValueError as damage:
+            raise ValueError(f"{path}: {damage}") from None
+
+    @staticmethod
+    def from_json(text: str) -> TrainConfig:
+        """The settings that `to_json` wrote.
+
+        Raises:
+            ValueError: If the text is damaged or has settings that this version does not know.
+        """
+        try:
+            settings = json.loads(text)
+            return TrainConfig(**{**settings, "policy": PolicyConfig(**settings["policy"])})
+        except (json.JSONDecodeError, KeyError, TypeError) as damage:
+            raise ValueError(f"no settings of this version of mapf-env ({damage})") from None
+
+    def to_json(self) -> str:
+        """The settings as text."""
+        return json.dumps(asdict(self), indent=2) + "\n"
+
+
+RECIPES: dict[Recipe, TrainConfig] = {
+    "paper": TrainConfig(),
+    "quick": replace(
+        TrainConfig(policy=PolicyConfig(encoder="lean")),
+        train_maps=2000,
+        cases_per_map=10,
+        validation_cases_per_map=5,
+        epochs=40,
+        updates_per_epoch=800,
+        batch_size=32,
+        demonstration_steps=32_768,
+        dagger_every=1,
+        dagger_steps=8192,
+        fresh_window=32_768,
+        augment=True,
+    ),
+}
+"""Complete sets of settings: the paper's, and one that takes about ten minutes on two CPU cores."""

@@ -1,0 +1,225 @@
+"""How good a team is: the metrics of the paper, with intervals, for policies, baselines and the expert."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich import box
+from rich.table import Table
+
+import experts
+from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.rollout import GreedyActor, Rollouts, rollout
+from mapf_env import Instance, Solution
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A mean with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @staticmethod
+    def proportion(outcomes: npt.NDArray[np.bool_]) -> Estimate:
+        """The share of true outcomes, with Wilson's interval."""
+        n, share, z = len(outcomes), float(outcomes.mean()), 1.96
+        centre = (share + z * z / (2 * n)) / (1 + z * z / n)
+        spread = z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+        return Estimate(share, max(centre - spread, 0.0), min(centre + spread, 1.0))
+
+    @staticmethod
+    def average(values: npt.NDArray[np.float64]) -> Estimate:
+        """The mean, with the normal interval; not a number where there are no values."""
+        if len(values) == 0:
+            return Estimate(math.nan, math.nan, math.nan)
+        mean = float(values.mean())
+        spread = 1.96 * float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.inf
+        return Estimate(mean, mean - spread, mean + spread)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exam:
+    """Cases with the expert's solution, which sets the time limit and the flowtime to compare with."""
+
+    instances: list[Instance]
+    solutions: list[Solution]
+    lower_bounds: npt.NDArray[np.int64]
+    """(C,) lower bounds of the optimal sums of costs."""
+    max_steps: npt.NDArray[np.int64]
+    """(C,) T_max of each case."""
+    unsolved: int
+    """Cases left out because the expert did not solve them within its limits."""
+
+    @staticmethod
+    def prepare(instances: Sequence[Instance], *, w: float, timeout: float, threads: int) -> Exam:
+        """Solve the cases by the expert; T_max is `timeout` times the makespan of its solution.
+
+        Raises:
+            ValueError: If the expert solves none of them.
+        """
+        results = experts.solve_many(instances, w=w, threads=threads)
+        known = [i for i, result in enumerate(results) if result.solved]
+        if not known:
+            raise ValueError(f"the expert solved none of the {len(instances)} cases: make them easier or raise w")
+        solutions = [result.solution for result in results if result.solution is not None]
+        return Exam(
+            [instances[i] for i in known],
+            solutions,
+            np.array([results[i].lower_bound for i in known], np.int64),
+            np.array([max(math.ceil(timeout * solution.makespan), 1) for solution in solutions]),
+            len(instances) - len(known),
+        )
+
+    @property
+    def flowtimes(self) -> npt.NDArray[np.int64]:
+        """(C,) the expert's sums of costs."""
+        return np.array([each.sum_of_costs for each in self.solutions], np.int64)
+
+    def increase(self, flowtimes: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
+        """(C,) by how much flowtimes exceed the expert's, as a share of it."""
+        return (flowtimes - self.flowtimes) / np.maximum(self.flowtimes, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """One row of a results table."""
+
+    name: str
+    success_rate: Estimate
+    """Share of cases in which all robots were on their goals at once in time."""
+    flowtime_increase: Estimate
+    """Over the expert's flowtime, signed, over all cases; a robot that fails counts T_max."""
+    flowtime_increase_solved: Estimate
+    """The same over solved cases."""
+    makespan: Estimate
+    """Over solved cases, in steps."""
+    latched: float
+    """Share of cases in which every robot touched its goal at least once (the released code's success)."""
+
+
+def score(name: str, exam: Exam, rollouts: Rollouts) -> Score:
+    """The metrics of played cases."""
+    increase = exam.increase(rollouts.flowtime)
+    return Score(
+        name,
+        Estimate.proportion(rollouts.success),
+        Estimate.average(increase),
+        Estimate.average(increase[rollouts.success]),
+        Estimate.average(rollouts.makespan[rollouts.success].astype(np.float64)),
+        float(rollouts.latched.mean()),
+    )
+
+
+def compare(
+    exam: Exam,
+    policy: DecentralizedPolicy,
+    *,
+    temperature: float = 1.0,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda phase: None,
+) -> tuple[list[Score], dict[str, Rollouts]]:
+    """The results table of a policy beside the expert and no-learning baselines, on the same cases.
+
+    Returns:
+        The rows, and what the policy did, as "argmax" and "sampled".
+    """
+    progress("argmax")
+    argmax = rollout(policy, exam.instances, seed=seed, max_steps=exam.max_steps)
+    progress("sampled")
+    sampled = rollout(policy, exam.instances, sample=True, temperature=temperature, seed=seed, max_steps=exam.max_steps)
+    progress("greedy")
+    greedy = rollout(GreedyActor(exam.instances, seed=seed), exam.instances, seed=seed, max_steps=exam.max_steps)
+    progress("PIBT")
+    rows = [
+        score("policy argmax", exam, argmax),
+        score("policy sampled", exam, sampled),
+        score("greedy*", exam, greedy),
+        _pibt_score(exam, seed),
+        _expert_score(exam),
+    ]
+    return rows, {"argmax": argmax, "sampled": sampled}
+
+
+def _pibt_score(exam: Exam, seed: int) -> Score:
+    results = [
+        experts.pibt(instance, max_steps=int(limit), seed=seed)
+        for instance, limit in zip(exam.instances, exam.max_steps, strict=True)
+    ]
+    success = np.array([result.solution is not None for result in results])
+    # Where PIBT fails it keeps no paths: all robots count T_max, an upper bound of its flowtime.
+    failed = exam.max_steps * np.array([each.num_agents for each in exam.instances])
+    costs = np.array([failed[i] if result.cost is None else result.cost for i, result in enumerate(results)])
+    increase = exam.increase(costs)
+    makespans = np.array([each.solution.makespan for each in results if each.solution is not None], np.float64)
+    return Score(
+        "PIBT*",
+        Estimate.proportion(success),
+        Estimate.average(increase),
+        Estimate.average(increase[success]),
+        Estimate.average(makespans),
+        float(success.mean()),
+    )
+
+
+def _expert_score(exam: Exam) -> Score:
+    makespans = np.array([each.makespan for each in exam.solutions], np.float64)
+    zero = Estimate(0.0, 0.0, 0.0)
+    solved = np.ones(len(exam.instances), np.bool_)
+    return Score("expert*", Estimate.proportion(solved), zero, zero, Estimate.average(makespans), 1.0)
+
+
+def table(title: str, rows: Sequence[Score], exam: Exam) -> Table:
+    """The rows for the terminal, at most 80 columns wide."""
+    shown = Table(title=title, caption=_caption(exam), box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+    shown.add_column("", no_wrap=True)
+    for heading in ("success rate", "flowtime\nincrease", "of solved\ncases", "make-\nspan", "lat-\nched"):
+        shown.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        shown.add_row(
+            row.name,
+            _share(row.success_rate),
+            _percent(row.flowtime_increase),
+            _percent(row.flowtime_increase_solved),
+            "-" if math.isnan(row.makespan.mean) else f"{row.makespan.mean:.1f}",
+            f"{row.latched:.3f}",
+        )
+    return shown
+
+
+def as_json(rows: Sequence[Score], exam: Exam) -> dict[str, object]:
+    """The rows as plain data; null stands for what is not a finite number."""
+    plain = [_finite(asdict(row)) for row in rows]
+    return {"cases": len(exam.instances), "unsolved_by_expert": exam.unsolved, "rows": plain}
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(each) for name, each in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _caption(exam: Exam) -> str:
+    over_bound = float((np.maximum(exam.flowtimes, 1) / np.maximum(exam.lower_bounds, 1)).mean())
+    lines = [
+        f"{len(exam.instances)} cases, 95 % intervals; T_max follows from the expert's makespan",
+        f"the expert's flowtime is {over_bound:.4f} x its lower bound",
+        "* knows the whole map and learns nothing",
+    ]
+    if exam.unsolved:
+        lines.append(f"{exam.unsolved} more cases are left out: the expert did not solve them")
+    return "\n".join(lines)
+
+
+def _share(estimate: Estimate) -> str:
+    return f"{estimate.mean:.3f} \\[{estimate.low:.3f}, {estimate.high:.3f}]"
+
+
+def _percent(estimate: Estimate) -> str:
+    return "-" if math.isnan(estimate.mean) else f"{estimate.mean:+.1%} ±{100 * (estimate.high - estimate.mean):.1f}"

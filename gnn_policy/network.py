@@ -1,0 +1,131 @@
+"""The paper's network: a CNN reads each view, a graph filter exchanges features, a shared MLP picks a move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor, nn
+
+from mapf_env import Action
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolicyConfig:
+    """All that defines a policy besides its weights; the defaults are the paper's."""
+
+    encoder: Literal["released", "lean"] = "released"
+    """CNN that reads a view: "released" is that of the paper's released code (5 convolutions, 3 poolings), "lean" has
+    3 strided convolutions and costs half."""
+    features: int = 128
+    """Features F that a robot extracts and communicates."""
+    taps: int = 3
+    """Filter taps K: K - 1 hops of communication; K = 1 is none."""
+    fov_radius: int = 4
+    """How many cells a robot sees in each direction (r_FOV)."""
+    comm_radius: float = 5.0
+    """Robots closer than this hear each other, in cells (r_COMM)."""
+
+    def __post_init__(self) -> None:
+        if self.encoder not in ENCODERS:
+            raise ValueError(f"encoder must be one of {', '.join(ENCODERS)}, got {self.encoder!r}")
+        for name, least in (("features", 1), ("taps", 1), ("fov_radius", 2)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if not self.comm_radius >= 0:
+            raise ValueError(f"comm_radius must not be negative, got {self.comm_radius}")
+
+
+def released_encoder(side: int, features: int) -> nn.Sequential:
+    """The CNN of the paper's released code for views (M, 3, side, side), to (M, features)."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, pool in ((32, True), (32, False), (64, True), (64, False), (128, True)):
+        layers += [nn.Conv2d(channels, width, 3, padding=1), nn.BatchNorm2d(width), nn.ReLU()]
+        if pool:
+            layers.append(nn.MaxPool2d(2))
+            side //= 2
+        channels = width
+    if side == 0:
+        raise ValueError("the released encoder pools three times and needs views of 8 x 8 at least: fov_radius >= 3")
+    return nn.Sequential(*layers, nn.Flatten(), nn.Linear(channels * side * side, features), nn.ReLU())
+
+
+def lean_encoder(side: int, features: int) -> nn.Sequential:
+    """Three strided convolutions for views (M, 3, side, side), to (M, features)."""
+    side = ((side + 1) // 2 + 1) // 2
+    return nn.Sequential(
+        nn.Conv2d(3, 48, 3, stride=2, padding=1),
+        nn.BatchNorm2d(48),
+        nn.ReLU(),
+        nn.Conv2d(48, 64, 3, stride=2, padding=1),
+        nn.BatchNorm2d(64),
+        nn.ReLU(),
+        nn.Conv2d(64, 128, min(3, side)),
+        nn.BatchNorm2d(128),
+        nn.ReLU(),
+        nn.Flatten(),
+        nn.Linear(128 * max(side - 2, 1) ** 2, features),
+        nn.ReLU(),
+    )
+
+
+ENCODERS = {"released": released_encoder, "lean": lean_encoder}
+
+
+def shift_operator(graph: Float[Tensor, "*B N N"]) -> Float[Tensor, "*B N N"]:
+    """The graph shift operator S = D^-1/2 A D^-1/2 of the adjacency A; the row of an isolated robot is zero.
+
+    Source: the paper's released code; the paper leaves S open.
+    """
+    degree = graph.sum(-1)
+    scale = torch.where(degree > 0, degree.clamp(min=1e-12).rsqrt(), 0.0)
+    return scale.unsqueeze(-1) * graph * scale.unsqueeze(-2)
+
+
+class GraphFilter(nn.Module):
+    """The graph convolution A(X; S) = sum over k < K of S^k X A_k (equation 1 of the paper), with a bias.
+
+    K taps make K - 1 exchanges with neighbours, so a robot's output depends on its (K - 1)-hop neighbourhood alone.
+    """
+
+    def __init__(self, in_features: int, out_features: int, taps: int) -> None:
+        super().__init__()
+        self.taps = taps
+        self.mix = nn.Linear(taps * in_features, out_features)
+
+    def forward(self, signal: Float[Tensor, "B N F"], shift: Float[Tensor, "B N N"]) -> Float[Tensor, "B N G"]:
+        """Filter the features of all robots over the graph whose shift operator is `shift`."""
+        shifted = [signal]
+        for _ in range(self.taps - 1):
+            shifted.append(torch.bmm(shift, shifted[-1]))
+        return self.mix(torch.cat(shifted, dim=-1))
+
+
+class DecentralizedPolicy(nn.Module):
+    """Views and the communication graph of a team to the logits of every robot's move.
+
+    All robots share the weights, whose number does not depend on the team's size.
+    """
+
+    def __init__(self, config: PolicyConfig = PolicyConfig()) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = ENCODERS[config.encoder](2 * config.fov_radius + 3, config.features)
+        self.filter = GraphFilter(config.features, config.features, config.taps)
+        self.head = nn.Linear(config.features, len(Action))
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, fov: Shaped[Tensor, "B N 3 S S"], graph: Float[Tensor, "B N N"]) -> Float[Tensor, "B N 5"]:
+        """Logits over the five moves from views (float or uint8) and adjacency."""
+        side = 2 * self.config.fov_radius + 3
+        if fov.shape[-1] != side:
+            raise ValueError(
+                f"views are {fov.shape[-2]}x{fov.shape[-1]}, this policy reads {side}x{side}: "
+                f"observe with fov_radius={self.config.fov_radius}"
+            )
+        views = fov.flatten(0, 1).to(self.head.weight.dtype, memory_format=torch.channels_last)
+        features = self.encoder(views).unflatten(0, fov.shape[:2])
+        return self.head(torch.relu(self.filter(features, shift_operator(graph))))

@@ -1,0 +1,84 @@
+"""`python -m gnn_policy.train`: expert data, training, evaluation and pictures in one command."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from gnn_policy import checkpoint
+from gnn_policy.command_line import mistakes_in_one_line
+from gnn_policy.config import RECIPES, Recipe, TrainConfig
+from gnn_policy.progress import TrainingProgress
+from gnn_policy.results import examine
+from gnn_policy.training import Training, split_cases
+
+
+@dataclass(frozen=True)
+class Command:
+    """Train a decentralized policy by imitating an ECBS expert, then examine it on held-out maps.
+
+    A killed run goes on where it stopped when the same command is given again.
+    """
+
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    recipe: Recipe = "quick"
+    """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "paper" is
+    the paper's setup."""
+    run: Path | None = None
+    """The run folder; runs/RECIPE if not given."""
+
+
+@dataclass(frozen=True)
+class _RecipeOnly:
+    recipe: Recipe = "quick"
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """The command that the arguments ask for; the recipe among them decides the defaults of the rest."""
+    chosen, _ = tyro.cli(_RecipeOnly, args=arguments, return_unknown_args=True, add_help=False)
+    defaults = Command(RECIPES[chosen.recipe], chosen.recipe)
+    return tyro.cli(Command, args=arguments, default=defaults, prog="python -m gnn_policy.train")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    console = Console()
+    with mistakes_in_one_line():
+        command = parse(sys.argv[1:] if arguments is None else arguments)
+        _train(command.config, command.run or Path("runs", command.recipe), console)
+
+
+def _train(config: TrainConfig, folder: Path, console: Console) -> None:
+    progress = TrainingProgress(config.epochs, console)
+    training = Training(config, folder, progress)
+    console.print(f"run folder: {folder}", highlight=False)
+    if training.history:
+        console.print(f"goes on after round {len(training.history)} of {config.epochs}", highlight=False)
+    try:
+        with progress:
+            training.run()
+    except KeyboardInterrupt:
+        console.print(f"stopped; the same command goes on after round {len(training.history)}", highlight=False)
+        raise SystemExit(130) from None
+    examine(
+        checkpoint.load(folder),
+        {f"{config.num_agents} robots, {config.test_maps} held-out maps": split_cases(config, "test")},
+        folder,
+        console,
+        w=config.w,
+        timeout=config.timeout,
+        seed=config.seed,
+        threads=training.threads,
+    )
+    console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
+    console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,274 @@
+"""The one training loop: collect, label, aggregate, fit, validate; round after round, resumable after each.
+
+A run folder holds
+    config.json                  the settings
+    demonstrations/round_*.safetensors  labelled states, one file for each round of collection
+    state.pt                     all that the next round needs, replaced as a whole after each round
+    best.safetensors             the policy of the best validation so far
+    metrics.csv, tensorboard/    one row for each round
+    learning_curve.png           their picture
+A round is a function of the settings, its number and the state before it: a run that was killed and resumed ends
+exactly like one that was not.
+"""
+
+from __future__ import annotations
+
+import csv
+import pickle
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch.utils.tensorboard import SummaryWriter
+
+from gnn_policy import checkpoint, evaluation
+from gnn_policy.cases import Split, make_cases
+from gnn_policy.command_line import cpu_threads
+from gnn_policy.config import TrainConfig
+from gnn_policy.dagger import Aggregator
+from gnn_policy.demonstrations import BatchMaker, Demonstrations
+from gnn_policy.imitation import ImitationLoss
+from gnn_policy.learning_curve import Round, draw_learning_curve
+from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.progress import TrainingProgress
+from gnn_policy.rollout import rollout
+from mapf_env import Instance
+from mapf_env.files import remove_drafts, replacing
+
+
+def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None) -> list[Instance]:
+    """The cases of one split as the settings define them."""
+    maps, cases = {
+        "train": (config.train_maps, config.cases_per_map),
+        "validation": (config.validation_maps, config.validation_cases_per_map),
+        "test": (config.test_maps, config.cases_per_map),
+    }[split]
+    return make_cases(
+        split,
+        seed=config.data_seed,
+        maps=maps,
+        cases_per_map=cases,
+        num_agents=config.num_agents if num_agents is None else num_agents,
+        height=config.height,
+        width=config.width,
+        density=config.density,
+        style=config.style,
+    )
+
+
+def open_run(folder: Path, config: TrainConfig) -> None:
+    """Make the run folder, or accept one that holds an unfinished run with the same settings.
+
+    Raises:
+        FileExistsError: If the folder holds something else.
+    """
+    if folder.is_dir():
+        for each in (folder, folder / "demonstrations"):
+            remove_drafts(each)
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        folder.mkdir(parents=True, exist_ok=True)
+        config.save(folder / "config.json")
+        return
+    if not (folder / "config.json").is_file():
+        raise FileExistsError(f"{folder} exists and is no training run: choose another folder with --run")
+    known = TrainConfig.load(folder / "config.json")
+    if known != replace(config, threads=known.threads, device=known.device):
+        old, new = asdict(known), asdict(config)
+        differ = [name for name in new if old[name] != new[name] and name not in ("threads", "device")]
+        raise FileExistsError(
+            f"{folder} holds a run with other settings ({', '.join(differ)}): choose another folder with --run"
+        )
+    if (folder / "results.json").exists():
+        raise FileExistsError(
+            f"{folder} holds a finished run: evaluate it with `python -m gnn_policy.evaluate {folder}`, "
+            "or choose another folder with --run"
+        )
+
+
+class Training:
+    """A training run in its folder; `run` goes on from the last finished round.
+
+    Raises:
+        ValueError: If settings do not fit together, or a file of the run is damaged.
+        FileExistsError: If the folder holds something else than an unfinished run with these settings.
+    """
+
+    def __init__(self, config: TrainConfig, folder: Path, progress: TrainingProgress) -> None:
+        self.config, self.folder, self.progress = config, folder, progress
+        self.threads = cpu_threads(config.threads)
+        torch.set_num_threads(self.threads)
+        torch.manual_seed(config.seed)
+        self.policy = _on_device(DecentralizedPolicy(config.policy), config.device)
+        self.loss = ImitationLoss(self.policy)
+        self.optimizer = torch.optim.Adam(
+            self.policy.parameters(),
+            lr=config.lr,
+            betas=(config.beta1, 0.999),
+            weight_decay=config.weight_decay,
+            fused=True,
+        )
+        self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.epochs, config.final_lr)
+        self.history: list[Round] = []
+        self._seconds_before = 0.0
+        self._began = time.monotonic()
+        self._instances = split_cases(config, "train")
+        self._validation = split_cases(config, "validation")
+        open_run(folder, config)
+        (folder / "demonstrations").mkdir(exist_ok=True)
+        if (folder / "state.pt").exists():
+            self._restore()
+        self._shards = [Demonstrations.load(self._shard(r)) for r in range(len(self.history)) if self._collects(r)]
+
+    def run(self) -> None:
+        """Train all remaining rounds."""
+        config = self.config
+        exam = evaluation.Exam.prepare(self._validation, w=config.w, timeout=config.timeout, threads=self.threads)
+        batches = BatchMaker(
+            self._instances, config.policy.fov_radius, config.policy.comm_radius, augment=config.augment
+        )
+        aggregator = Aggregator(config, self.policy, self._instances, self.threads)
+        writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history))
+        try:
+            for number in range(len(self.history), config.epochs):
+                row = self._round(number, aggregator, batches, exam)
+                self.history.append(row)
+                for name, value in asdict(row).items():
+                    if value is not None and name != "round":
+                        writer.add_scalar(name, value, number)
+                writer.flush()
+                self._save()
+                self.progress.finished(row)
+        finally:
+            writer.close()
+            aggregator.close()
+
+    def _round(self, number: int, aggregator: Aggregator, batches: BatchMaker, exam: evaluation.Exam) -> Round:
+        config = self.config
+        began, unlabelled = time.monotonic(), 0
+        if self._collects(number):
+            self.progress.phase(number, "collecting")
+            steps = config.dagger_steps if number else config.demonstration_steps
+            collected, unlabelled = aggregator.collect(number, steps)
+            collected.save(self._shard(number))
+            self._shards.append(collected)
+        demonstrations = Demonstrations.concatenate(self._shards)
+        self._shards = [demonstrations]
+        if len(demonstrations) == 0:
+            raise ValueError("the expert solved none of the visited states: raise expert_nodes or make cases easier")
+        between = time.monotonic()
+        lr = float(self.scheduler.get_last_lr()[0])
+        loss, accuracy, updates = self._fit(number, demonstrations, batches)
+        self.scheduler.step()
+        done = time.monotonic()
+        previous = self.history[-1] if self.history else None
+        row = Round(
+            round=number,
+            updates=updates + (previous.updates if previous else 0),
+            samples=updates * config.batch_size * config.num_agents + (previous.samples if previous else 0),
+            seconds=0.0,
+            collect_seconds=between - began,
+            fit_seconds=done - between,
+            loss=loss,
+            accuracy=accuracy,
+            lr=lr,
+            demonstrations=len(demonstrations),
+            unlabelled=unlabelled,
+        )
+        if (number + 1) % config.validate_every == 0 or number + 1 == config.epochs:
+            self.progress.phase(number, "validation")
+            self._validate(row, exam)
+        row.seconds = self._seconds_before + time.monotonic() - self._began
+        return row
+
+    def _collects(self, number: int) -> bool:
+        every = self.config.dagger_every
+        return number == 0 or (every > 0 and number % every == 0)
+
+    def _fit(self, number: int, demonstrations: Demonstrations, batches: BatchMaker) -> tuple[float, float, int]:
+        config = self.config
+        rng = np.random.default_rng([config.seed, number])
+        draws = self._pass(demonstrations, rng) if config.updates_per_epoch is None else self._draw(demonstrations, rng)
+        updates = len(draws)
+        self.policy.train()
+        losses, accuracies = np.zeros(updates), np.zeros(updates)
+        robots = config.batch_size * config.num_agents
+        for update, chosen in enumerate(draws):
+            batch = batches.batch(demonstrations, chosen, rng).to(config.device)
+            outcome = self.loss(batch)
+            self.optimizer.zero_grad()
+            outcome["loss_imitation"].backward()
+            self.optimizer.step()
+            losses[update], accuracies[update] = outcome["loss_imitation"].item(), outcome["accuracy"].item()
+            self.progress.fitted(number, update + 1, updates, losses[: update + 1], robots)
+        return float(losses.mean()), float(accuracies.mean()), updates
+
+    def _pass(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[npt.NDArray[np.intp]]:
+        """Every state once, in random order."""
+        order = rng.permutation(len(demonstrations))
+        return np.array_split(order, -(-len(order) // self.config.batch_size))
+
+    def _draw(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[npt.NDArray[np.intp]]:
+        """A number of batches, part of each from the newest states if any were aggregated since round 0."""
+        config, size = self.config, len(demonstrations)
+        aggregated = config.dagger_every > 0 and len(self.history) >= config.dagger_every
+        newest = max(size - config.fresh_window, 0) if aggregated else 0
+        fresh = round(config.fresh_share * config.batch_size)
+        first = np.repeat([newest, 0], [fresh, config.batch_size - fresh])
+        return list(rng.integers(first, size, (config.updates_per_epoch or 0, config.batch_size)))
+
+    def _validate(self, row: Round, exam: evaluation.Exam) -> None:
+        played = rollout(self.policy, exam.instances, max_steps=exam.max_steps, seed=self.config.seed)
+        result = evaluation.score("validation", exam, played)
+        row.validation_success = result.success_rate.mean
+        row.validation_flowtime_increase = result.flowtime_increase.mean
+        best = [each for each in self.history if each.validation_success is not None]
+        if all(self._merit(row) > self._merit(each) for each in best):
+            checkpoint.save(self.policy, self.folder / "best.safetensors", training=self.config.to_json())
+
+    @staticmethod
+    def _merit(row: Round) -> tuple[float, float]:
+        return row.validation_success or 0.0, -(row.validation_flowtime_increase or 0.0)
+
+    def _shard(self, number: int) -> Path:
+        return self.folder / "demonstrations" / f"round_{number:04d}.safetensors"
+
+    def _save(self) -> None:
+        """Write the records of the round, then the state that says it is done."""
+        state = {
+            "policy": self.policy.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "scheduler": self.scheduler.state_dict(),
+            "history": [asdict(row) for row in self.history],
+        }
+        with replacing(self.folder / "metrics.csv") as draft, draft.open("w", newline="") as file:
+            table = csv.DictWriter(file, list(asdict(self.history[0])))
+            table.writeheader()
+            table.writerows(state["history"])
+        if self.history[-1].validation_success is not None:
+            with replacing(self.folder / "learning_curve.png") as draft:
+                draw_learning_curve(self.history, draft)
+        with replacing(self.folder / "state.pt") as draft:
+            torch.save(state, draft)
+
+    def _restore(self) -> None:
+        file = self.folder / "state.pt"
+        try:
+            state: dict[str, Any] = torch.load(file, weights_only=True, map_location=self.config.device)
+            self.policy.load_state_dict(state["policy"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.scheduler.load_state_dict(state["scheduler"])
+            self.history = [Round(**row) for row in state["history"]]
+        except (pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError, RuntimeError):
+            raise ValueError(f"{file} is damaged: choose another folder with --run, or delete this one") from None
+        self._seconds_before = self.history[-1].seconds
+
+
+def _on_device(policy: DecentralizedPolicy, device: str) -> DecentralizedPolicy:
+    try:
+        return policy.to(device)
+    except (RuntimeError, AssertionError) as refusal:
+        raise ValueError(f"the network cannot live on device {device!r}: {str(refusal).splitlines()[0]}") from None

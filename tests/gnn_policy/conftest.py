@@ -1,0 +1,20 @@
+"""The pupil's tests run its shape types, on one thread."""
+
+from jaxtyping import install_import_hook
+
+install_import_hook("gnn_policy.network", "beartype.beartype")
+
+import pytest  # noqa: E402
+import torch  # noqa: E402
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread_to_begin_with():
+    """For what fixtures of a module compute."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """The commands set the number of threads of the process."""
+    torch.set_num_threads(1)

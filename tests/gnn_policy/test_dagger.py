@@ -1,0 +1,205 @@
+"""Aggregation: states of the mixture, labels of the expert alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+import experts
+from gnn_policy import DecentralizedPolicy, PolicyConfig
+from gnn_policy.cases import make_cases
+from gnn_policy.config import TrainConfig
+from gnn_policy.dagger import Aggregator, Mixture, Teacher
+from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
+
+STEPS = [(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)]
+CONFIG = TrainConfig(
+    policy=PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=3.0),
+    num_agents=4,
+    rollout_teams=5,
+    rollout_length=24,
+    dagger_every=1,
+    seed=3,
+)
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return make_cases(
+        "train", seed=0, maps=6, cases_per_map=2, num_agents=4, height=7, width=6, density=0.15, style="cells"
+    )
+
+
+@pytest.fixture
+def policy():
+    torch.manual_seed(0)
+    return DecentralizedPolicy(CONFIG.policy)
+
+
+def collected(config, policy, cases, number, steps):
+    aggregator = Aggregator(config, policy, cases, 1)
+    try:
+        return aggregator.collect(number, steps)
+    finally:
+        aggregator.close()
+
+
+def after(positions, moves):
+    return positions + np.array(STEPS)[moves]
+
+
+def assert_labels_are_the_experts(cases, states, **limits):
+    for case, positions, moves in zip(states.cases, states.positions, states.actions, strict=True):
+        result = experts.solve(cases[case].at(positions), **limits)
+        assert result.solution
+        paths = result.solution.paths
+        expected = paths[1] if len(paths) > 1 else paths[0]
+        assert np.array_equal(after(positions, moves), expected)
+
+
+def test_round_zero_is_the_expert_itself(cases, policy):
+    """Visited states are closed under the expert's moves, except where a team was cut off, and lead to the goals."""
+    states, unsolved = collected(CONFIG, policy, cases, 0, 5 * 24 * 3)
+    assert unsolved == 0
+    assert_labels_are_the_experts(cases, states, w=CONFIG.w, node_limit=CONFIG.expert_nodes)
+    known = {(int(c), p.tobytes()) for c, p in zip(states.cases, states.positions.astype(np.int32), strict=True)}
+    assert len(known) == len(states), "a state occurs twice"
+    assert set(states.cases.tolist()) == set(range(len(cases)))
+    for case in set(states.cases.tolist()):
+        assert (case, cases[case].starts.tobytes()) in known
+    ended = cut_off = 0
+    for case, positions, moves in zip(states.cases, states.positions.astype(np.int32), states.actions, strict=True):
+        assert not (positions == cases[case].goals).all()
+        following = after(positions, moves).astype(np.int32)
+        for i in range(4):
+            for j in range(i):
+                assert (following[i] != following[j]).any()
+                assert (following[i] != positions[j]).any() or (following[j] != positions[i]).any()
+        ended += (following == cases[case].goals).all()
+        cut_off += (int(case), following.tobytes()) not in known and not (following == cases[case].goals).all()
+    assert ended > 0
+    assert cut_off <= 5 * 3, "more teams broke off than the ends of three batches explain"
+
+
+def test_every_team_reaches_its_goals_under_the_expert(cases, policy):
+    mixture = Mixture(policy, Teacher(cases, w=1.05, node_limit=2000, threads=1), sample=False)
+    env = TeamEnv(len(cases), cases, max_cycles=60, fov_radius=2, dtype="uint8")
+    state, reached = env.reset(seed=0), set()
+    for _ in range(60):
+        both, state = env.step_and_maybe_reset(mixture(state))
+        done = both["next", "terminated"].squeeze(-1)
+        reached |= set(both[CASE][done].tolist())
+        assert not both["next", "truncated"].any()
+    assert reached == set(range(len(cases)))
+
+
+def test_later_rounds_visit_what_the_policy_does_and_label_what_the_expert_would(cases, policy):
+    states, unsolved = collected(CONFIG, policy, cases, 1, 1)
+    assert unsolved == 0
+    assert_labels_are_the_experts(cases, states, w=CONFIG.w, node_limit=CONFIG.expert_nodes)
+    expert_only, _ = collected(CONFIG, policy, cases, 0, 1)
+    expert_states = {(int(c), p.tobytes()) for c, p in zip(expert_only.cases, expert_only.positions, strict=True)}
+    visited = {(int(c), p.tobytes()) for c, p in zip(states.cases, states.positions, strict=True)}
+    assert visited - expert_states
+    keys = [(int(c), p.tobytes()) for c, p in zip(states.cases, states.positions, strict=True)]
+    assert len(set(keys)) == len(keys)
+
+
+def test_collection_plays_the_weights_of_the_moment(cases, policy):
+    """The collector must not keep a copy of the policy that training goes on to change."""
+    aggregator = Aggregator(CONFIG, policy, cases, 1)
+    before, _ = aggregator.collect(1, 1)
+    again, _ = aggregator.collect(1, 1)
+    assert np.array_equal(before.positions, again.positions)
+    with torch.no_grad():
+        policy.head.weight.zero_()
+        policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))
+    idle, _ = aggregator.collect(1, 1)
+    aggregator.close()
+    assert {p.tobytes() for p in idle.positions} <= {each.starts.astype(np.int16).tobytes() for each in cases}
+
+
+@pytest.mark.parametrize("sample", [False, True])
+def test_a_round_depends_on_seed_number_and_weights_alone(cases, policy, sample):
+    config = replace(CONFIG, sample_rollouts=sample, beta_decay=0.5)
+    aggregator = Aggregator(config, policy, cases, 1)
+    rounds = {number: aggregator.collect(number, 100)[0] for number in (0, 1, 2)}
+    aggregator.close()
+    for number in (2, 1):
+        torch.manual_seed(number)  # the global generator plays no part
+        alone, _ = collected(config, policy, cases, number, 100)
+        for name in ("cases", "positions", "actions"):
+            assert np.array_equal(getattr(alone, name), getattr(rounds[number], name))
+    assert not np.array_equal(rounds[1].cases[:50], rounds[2].cases[:50])
+    other, _ = collected(replace(config, seed=4), policy, cases, 1, 100)
+    assert not np.array_equal(other.cases[:50], rounds[1].cases[:50])
+
+
+def states_at_starts(cases, teams):
+    chosen = np.arange(teams) % len(cases)
+    env = TeamEnv(teams, cases, fov_radius=2, comm_radius=3.0)
+    state = env.reset(seed=0)
+    state[CASE] = torch.from_numpy(chosen)
+    state[POSITIONS] = torch.from_numpy(np.stack([cases[i].starts for i in chosen]))
+    return state
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.3, 1.0])
+def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
+    with torch.no_grad():
+        policy.head.weight.zero_()
+        policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))  # this policy always stays
+    mixture = Mixture(policy.eval(), Teacher(cases, w=1.05, node_limit=2000, threads=1), sample=False)
+    mixture.beta = beta
+    mixture.random.manual_seed(0)
+    state = states_at_starts(cases, 2000)
+    moves = mixture(state)[ACTION].numpy()
+    labels, solved = experts.relabel([cases[i] for i in state[CASE].tolist()], state[POSITIONS].numpy())
+    assert solved.all()
+    moving = (labels != 4).any(axis=1)
+    by_expert = (moves == labels).all(axis=1)
+    assert ((moves == 4).all(axis=1) | by_expert).all(), "a team mixes the moves of both"
+    assert by_expert[moving].mean() == pytest.approx(beta, abs=0.04)
+
+
+def test_sampled_moves_follow_the_softmax(cases, policy):
+    policy.eval()
+    mixture = Mixture(policy, Teacher(cases, w=1.05, node_limit=2000, threads=1), sample=True)
+    mixture.beta = 0.0
+    state = states_at_starts(cases, 1).expand(4000).contiguous()
+    moves = mixture(state)[ACTION].numpy()
+    with torch.no_grad():
+        shares = torch.softmax(policy(state[FOV][:1], state[GRAPH][:1]), -1)[0].numpy()
+    counted = np.stack([(moves == action).mean(axis=0) for action in range(5)], -1)
+    np.testing.assert_allclose(counted, shares, atol=0.04)
+
+
+def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
+    crowded = make_cases(
+        "train", seed=1, maps=2, cases_per_map=4, num_agents=11, height=4, width=4, density=0.0, style="cells"
+    )
+    teacher = Teacher(crowded, w=1.0, node_limit=3, threads=1)
+    positions = np.stack([each.starts for each in crowded])
+    solved = [experts.solve(each, w=1.0, node_limit=3).solved for each in crowded]
+    assert not all(solved), "the cases are too easy for this test"
+    states, unsolved = teacher.label(np.arange(8), positions)
+    assert unsolved == solved.count(False)
+    assert states.cases.tolist() == [i for i in range(8) if solved[i]]
+    twice, counted = teacher.label(np.tile(np.arange(8), 2), np.tile(positions, (2, 1, 1)))
+    assert (len(twice), counted) == (len(states), unsolved)
+
+
+def test_labels_keep_the_order_of_the_visits(cases):
+    teacher = Teacher(cases, w=1.05, node_limit=2000, threads=1)
+    order = np.array([7, 2, 7, 9, 0, 2])
+    states, _ = teacher.label(order, np.stack([cases[i].starts for i in order]))
+    assert states.cases.tolist() == [7, 2, 9, 0]
+
+
+def test_the_mixture_reads_what_the_environment_writes(policy, cases):
+    mixture = Mixture(policy, Teacher(cases, w=1.05, node_limit=2000, threads=1), sample=False)
+    state = TeamEnv(2, cases).reset()
+    assert isinstance(state, TensorDict)
+    assert set(mixture.in_keys) <= set(state.keys(include_nested=True))

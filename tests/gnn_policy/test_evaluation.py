@@ -1,0 +1,196 @@
+"""The metrics, by hand."""
+
+import io
+import json
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+import experts
+from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluation, rollout
+from gnn_policy.cases import make_cases
+from gnn_policy.evaluation import Estimate, Exam
+from mapf_env import Instance
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [
+        (0, 10, 0.0000, 0.2775),  # Newcombe 1998, table I, method 3 (and by inversion below)
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0000, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_wilsons_interval_as_tabulated(successes, trials, low, high):
+    estimate = Estimate.proportion(np.arange(trials) < successes)
+    assert estimate.mean == successes / trials
+    assert estimate.low == pytest.approx(low, abs=6e-5)
+    assert estimate.high == pytest.approx(high, abs=6e-5)
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(1, 7), (5, 10), (99, 100), (880, 900), (10, 10)])
+def test_wilsons_interval_holds_the_shares_that_the_outcome_does_not_reject(successes, trials):
+    """Its ends solve |p - x| = 1.96 sqrt(x (1 - x) / n)."""
+    estimate = Estimate.proportion(np.arange(trials) < successes)
+    share = successes / trials
+
+    def rejected(x):
+        return abs(share - x) > 1.96 * math.sqrt(x * (1 - x) / trials)
+
+    def boundary(inside, outside):
+        for _ in range(60):
+            middle = (inside + outside) / 2
+            inside, outside = (inside, middle) if rejected(middle) else (middle, outside)
+        return inside
+
+    assert estimate.low == pytest.approx(boundary(share, 0.0), abs=1e-9)
+    assert estimate.high == pytest.approx(1.0 if successes == trials else boundary(share, 1.0), abs=1e-9)
+
+
+def test_the_interval_of_a_mean():
+    estimate = Estimate.average(np.array([1.0, 2.0, 3.0, 6.0]))
+    deviation = math.sqrt((4 + 1 + 0 + 9) / 3)
+    assert estimate.mean == 3
+    assert estimate.high - 3 == pytest.approx(1.96 * deviation / 2)
+    assert 3 - estimate.low == pytest.approx(1.96 * deviation / 2)
+    assert math.isnan(Estimate.average(np.array([])).mean)
+    alone = Estimate.average(np.array([4.0]))
+    assert (alone.mean, alone.low, alone.high) == (4, -math.inf, math.inf)
+
+
+def corridor(*cells):
+    """One robot in a corridor of nine cells for each (start, goal)."""
+    grid = np.zeros((1, 9), bool)
+    return [Instance(grid, [[0, start]], [[0, goal]]) for start, goal in cells]
+
+
+class Walker:
+    """Goes right in every step."""
+
+    border = 1
+
+    def act(self, cases, obstacles, positions, goals, time):
+        return np.full(positions.shape[:2], 3)
+
+
+class Dawdler:
+    """Stays twice, then goes right."""
+
+    border = 1
+
+    def act(self, cases, obstacles, positions, goals, time):
+        return np.full(positions.shape[:2], 4 if time < 2 else 3)
+
+
+def test_flowtime_increase_by_hand():
+    exam = Exam.prepare(corridor((0, 4), (1, 2), (3, 0), (5, 5)), w=1.0, timeout=3.0, threads=1)
+    assert exam.max_steps.tolist() == [12, 3, 9, 1]
+    assert exam.flowtimes.tolist() == [4, 1, 3, 0]
+    assert exam.lower_bounds.tolist() == [4, 1, 3, 0]
+    walked = evaluation.score("walker", exam, rollout(Walker(), exam.instances, max_steps=exam.max_steps))
+    assert walked.success_rate.mean == 3 / 4
+    assert walked.flowtime_increase.mean == pytest.approx((0 + 0 + 6 / 3 + 0) / 4)
+    assert walked.flowtime_increase_solved.mean == 0
+    assert walked.makespan.mean == pytest.approx((4 + 1 + 0) / 3)
+    assert walked.latched == 3 / 4
+    dawdled = evaluation.score("dawdler", exam, rollout(Dawdler(), exam.instances, max_steps=exam.max_steps))
+    assert dawdled.flowtime_increase.mean == pytest.approx((2 / 4 + 2 / 1 + 6 / 3 + 0) / 4)
+    assert dawdled.flowtime_increase_solved.mean == pytest.approx((2 / 4 + 2 / 1 + 0) / 3)
+
+
+def test_a_time_limit_is_rounded_up_and_never_zero():
+    exam = Exam.prepare(corridor((0, 5), (2, 2)), w=1.0, timeout=1.5, threads=1)
+    assert exam.max_steps.tolist() == [8, 1]
+
+
+def test_cases_that_the_expert_does_not_solve_are_counted_and_left_out():
+    cases = corridor((0, 4), (1, 2), (3, 0))
+    swap = Instance(np.zeros((1, 2), bool), [[0, 0], [0, 1]], [[0, 1], [0, 0]])
+    with pytest.raises(ValueError, match="solved none of the 1 cases"):
+        Exam.prepare([swap], w=1.0, timeout=3.0, threads=1)
+    pairs = [swap, Instance(np.zeros((1, 2), bool), [[0, 0], [0, 1]], [[0, 0], [0, 1]])]
+    exam = Exam.prepare(pairs, w=1.0, timeout=3.0, threads=1)
+    assert exam.unsolved == 1
+    assert exam.instances == pairs[1:]
+    assert Exam.prepare(cases, w=1.0, timeout=3.0, threads=1).unsolved == 0
+
+
+@pytest.fixture(scope="module")
+def compared():
+    torch.manual_seed(0)
+    policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))
+    cases = make_cases(
+        "test", seed=0, maps=5, cases_per_map=3, num_agents=4, height=6, width=6, density=0.1, style="cells"
+    )
+    exam = Exam.prepare(cases, w=1.05, timeout=3.0, threads=1)
+    phases = []
+    rows, played = evaluation.compare(exam, policy, seed=3, temperature=2.0, progress=phases.append)
+    return exam, policy, rows, played, phases
+
+
+def test_the_comparison_has_a_row_for_each_competitor(compared):
+    exam, policy, rows, played, phases = compared
+    assert [row.name for row in rows] == ["policy argmax", "policy sampled", "greedy*", "PIBT*", "expert*"]
+    assert len(phases) == 4
+    again = rollout(policy, exam.instances, seed=3, max_steps=exam.max_steps)
+    assert rows[0] == evaluation.score(rows[0].name, exam, again)
+    sampled = rollout(policy, exam.instances, sample=True, temperature=2.0, seed=3, max_steps=exam.max_steps)
+    assert rows[1] == evaluation.score(rows[1].name, exam, sampled)
+    assert np.array_equal(played["sampled"].flowtime, sampled.flowtime)
+
+
+def test_pibt_is_measured_like_everybody(compared):
+    exam, _, rows, _, _ = compared
+    increases, solved = [], 0
+    for case, limit, base in zip(exam.instances, exam.max_steps, exam.flowtimes, strict=True):
+        result = experts.pibt(case, max_steps=int(limit), seed=3)
+        solved += result.solved
+        flowtime = result.solution.sum_of_costs if result.solution else limit * case.num_agents
+        increases.append(flowtime / base - 1)
+    assert rows[3].success_rate.mean == solved / len(exam.instances)
+    assert rows[3].flowtime_increase.mean == pytest.approx(np.mean(increases))
+
+
+def test_the_expert_is_its_own_measure(compared):
+    exam, _, rows, _, _ = compared
+    expert = rows[4]
+    assert (expert.success_rate.mean, expert.flowtime_increase.mean, expert.latched) == (1.0, 0.0, 1.0)
+    assert expert.makespan.mean == pytest.approx(np.mean([each.makespan for each in exam.solutions]))
+    assert all(base >= bound for base, bound in zip(exam.flowtimes, exam.lower_bounds, strict=True))
+    assert (exam.flowtimes <= 1.05 * exam.lower_bounds + 1e-9).all()
+
+
+def test_the_numbers_are_strict_json_also_where_nothing_was_solved(compared):
+    exam, _, rows, _, _ = compared
+    nothing = Exam.prepare(corridor((3, 0)), w=1.0, timeout=1.0, threads=1)
+    lost = evaluation.score("lost", nothing, rollout(Walker(), nothing.instances, max_steps=nothing.max_steps))
+    for data in (evaluation.as_json(rows, exam), evaluation.as_json([lost], nothing)):
+        assert json.loads(json.dumps(data, allow_nan=False)) == data
+        assert "makespan" in json.dumps(data)
+    (row,) = json.loads(json.dumps(evaluation.as_json([lost], nothing)))["rows"]
+    assert row["makespan"]["mean"] is None
+
+
+def test_the_table_shows_every_figure_within_eighty_columns(compared):
+    exam, _, rows, _, _ = compared
+    shown = io.StringIO()
+    Console(file=shown, width=80).print(evaluation.table("teams", rows, exam))
+    text = shown.getvalue()
+    assert "…" not in text
+    for row in rows:
+        assert row.name in text
+        assert f"{row.success_rate.mean:.3f}" in text
+        assert f"[{row.success_rate.low:.3f}, {row.success_rate.high:.3f}]" in text
+        assert f"{row.flowtime_increase.mean:+.1%}" in text
+        assert f"{row.makespan.mean:.1f}" in text or math.isnan(row.makespan.mean)
+
+
+def test_wilson_narrows_with_more_cases():
+    widths = [(e.high - e.low) for n in (10, 100, 1000) for e in [Estimate.proportion(np.arange(n) % 10 != 0)]]
+    assert all(one > two for one, two in pairwise(widths))

@@ -1,0 +1,94 @@
+"""The command that trains: complete help, options of the settings, one line for a mistake."""
+
+import re
+from dataclasses import fields, replace
+
+import pytest
+
+from gnn_policy import PolicyConfig, train
+from gnn_policy.config import RECIPES, TrainConfig
+
+
+def shown_help(capsys, command):
+    with pytest.raises(SystemExit) as end:
+        command(["--help"])
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_help_names_every_setting_and_says_what_it_is(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    text = shown_help(capsys, train.main)
+    options = [each.name for each in fields(TrainConfig) if each.name != "policy"]
+    options += [f"policy.{each.name}" for each in fields(PolicyConfig)] + ["recipe", "run"]
+    for option in options:
+        assert f"--{option.replace('_', '-')}" in text, option
+    for words in ("T_max in makespans", "Filter taps K", "L2 regularisation", "quick", "paper"):
+        assert words in text
+
+
+def test_an_option_for_every_setting_reaches_the_settings():
+    assert train.parse([]).config == RECIPES["quick"]
+    assert train.parse(["--recipe", "paper"]).config == TrainConfig()
+    arguments = "--seed 7 --recipe paper --lr 0.01 --policy.taps 2 --run here --no-augment"
+    command = train.parse(arguments.split())
+    assert command.config == replace(TrainConfig(), seed=7, lr=0.01, policy=PolicyConfig(taps=2), augment=False)
+    assert str(command.run) == "here"
+    quick = train.parse(["--policy.taps", "1"]).config
+    assert quick == replace(RECIPES["quick"], policy=replace(RECIPES["quick"].policy, taps=1))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ("--epochs 0", "epochs"),
+        ("--density 0.99", "density|obstacles|room"),
+        ("--num-agents 500", "agents"),
+        ("--policy.encoder released --policy.fov-radius 2", "fov_radius"),
+        ("--device abacus", "abacus"),
+        ("--w 0.5", "w must be"),
+    ],
+)
+def test_a_mistake_takes_one_line_and_leaves_no_folder(tmp_path, capsys, wrong, named):
+    with pytest.raises(SystemExit) as end:
+        train.main(["--run", str(tmp_path / "run"), "--threads", "1", "--train-maps", "2", *wrong.split()])
+    assert end.value.code == 2
+    shown = capsys.readouterr()
+    assert re.fullmatch(r"error: .+\n", shown.err)
+    assert re.search(named, shown.err)
+    assert "Traceback" not in shown.out + shown.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_is_taken_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(SystemExit) as end:
+        train.main(["--run", str(tmp_path), "--train-maps", "2"])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == (
+        f"error: {tmp_path} exists and is no training run: choose another folder with --run\n"
+    )
+
+
+@pytest.mark.parametrize("wrong", [["--surprise"], ["--epochs", "many"], ["--recipe", "cake"], ["--policy.taps", "0"]])
+def test_unknown_options_and_values_are_refused(capsys, wrong):
+    with pytest.raises(SystemExit) as end:
+        train.main(wrong)
+    assert end.value.code == 2
+    assert wrong[0].split(".")[-1].strip("-") in capsys.readouterr().err
+
+
+def test_a_finished_run_is_not_trained_over(tmp_path, capsys):
+    arguments = ["--run", str(tmp_path), "--train-maps", "2", "--validation-maps", "1"]
+    train.parse(arguments).config.save(tmp_path / "config.json")
+    (tmp_path / "results.json").write_text("{}")
+    with pytest.raises(SystemExit) as end:
+        train.main(arguments)
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {tmp_path} holds a finished run")
+    assert "--run" in error
+    assert error.count("\n") == 1
+    with pytest.raises(SystemExit):
+        train.main([*arguments, "--seed", "1"])
+    assert capsys.readouterr().err.startswith(f"error: {tmp_path} holds a run with other settings (seed)")
