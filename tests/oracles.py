@@ -1,0 +1,152 @@
+"""Slow judges in plain Python, written from the definitions; they share no code with what they judge.
+
+A cell is a tuple (row, col), a map a set of free cells or an (H, W) bool array, a team a list of cells.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+
+import numpy as np
+import numpy.typing as npt
+
+Cell = tuple[int, int]
+Grid = npt.NDArray[np.bool_]
+
+UP, LEFT, DOWN, RIGHT, IDLE = range(5)
+STEP: dict[int, Cell] = {UP: (-1, 0), LEFT: (0, -1), DOWN: (1, 0), RIGHT: (0, 1), IDLE: (0, 0)}
+
+
+def cells(array: Iterable[Iterable[int]]) -> list[Cell]:
+    """The rows of an (N, 2) array as cells."""
+    return [(int(row), int(col)) for row, col in array]
+
+
+def moved(cell: Cell, action: int) -> Cell:
+    """Where `action` leads from `cell`."""
+    return cell[0] + STEP[action][0], cell[1] + STEP[action][1]
+
+
+def free_cells(grid: Grid) -> set[Cell]:
+    """The cells of the map that are no obstacle."""
+    height, width = grid.shape
+    return {(row, col) for row in range(height) for col in range(width) if not grid[row, col]}
+
+
+def distances(grid: Grid, source: Cell) -> dict[Cell, int]:
+    """Steps from `source` to each cell that can be reached, by breadth-first search."""
+    free, steps, queue = free_cells(grid), {source: 0}, deque([source])
+    while queue:
+        here = queue.popleft()
+        for action in (UP, LEFT, DOWN, RIGHT):
+            there = moved(here, action)
+            if there in free and there not in steps:
+                steps[there] = steps[here] + 1
+                queue.append(there)
+    return steps
+
+
+def regions(grid: Grid) -> list[set[Cell]]:
+    """The connected free regions, the largest first."""
+    left, found = free_cells(grid), []
+    while left:
+        region = set(distances(grid, min(left)))
+        left -= region
+        found.append(region)
+    return sorted(found, key=len, reverse=True)
+
+
+def faults(grid: Grid, before: Sequence[Cell], after: Sequence[Cell]) -> list[str]:
+    """All that is wrong with one executed joint step: jumps, walls, vertex and swap conflicts."""
+    free, found = free_cells(grid), []
+    for robot, (here, there) in enumerate(zip(before, after, strict=True)):
+        if abs(here[0] - there[0]) + abs(here[1] - there[1]) > 1:
+            found.append(f"robot {robot} jumps from {here} to {there}")
+        if there not in free:
+            found.append(f"robot {robot} enters {there}")
+    found += [f"{count} robots at {cell}" for cell, count in Counter(after).items() if count > 1]
+    mover = {(here, there) for here, there in zip(before, after, strict=True) if here != there}
+    found += [f"a swap of {here} and {there}" for here, there in mover if (there, here) in mover]
+    return found
+
+
+def shield_faults(grid: Grid, before: Sequence[Cell], wanted: Sequence[int], executed: Sequence[int]) -> list[str]:
+    """All that is wrong with what the paper's shield made of `wanted`.
+
+    It may only turn actions into idle; what it executes has no fault; both robots of a swap stay; and whoever was
+    stopped had a reason: the map, a swap, or another robot in the wanted cell afterwards.
+    """
+    free = free_cells(grid)
+    aims = [moved(cell, action) for cell, action in zip(before, wanted, strict=True)]
+    after = [moved(cell, action) for cell, action in zip(before, executed, strict=True)]
+    exchanges = {(here, there) for here, there in zip(before, aims, strict=True) if here != there}
+    found = faults(grid, before, after)
+    for robot, aim in enumerate(aims):
+        swaps = (aim, before[robot]) in exchanges
+        stopped = executed[robot] != wanted[robot]
+        if stopped and executed[robot] != IDLE:
+            found.append(f"robot {robot} was turned from {wanted[robot]} to {executed[robot]}")
+        if swaps and executed[robot] != IDLE:
+            found.append(f"robot {robot} of a swap moves")
+        if stopped and aim in free and not swaps and aim not in after:
+            found.append(f"robot {robot} was stopped though {aim} stays empty")
+    return found
+
+
+def harmless(grid: Grid, before: Sequence[Cell], actions: Sequence[int]) -> list[int]:
+    """`actions` with every robot that takes part in a fault made idle, until none is left."""
+    chosen = list(actions)
+    free = free_cells(grid)
+    while True:
+        after = [moved(cell, action) for cell, action in zip(before, chosen, strict=True)]
+        count = Counter(after)
+        movers = {(here, there) for here, there in zip(before, after, strict=True) if here != there}
+        guilty = [
+            robot
+            for robot, (here, there) in enumerate(zip(before, after, strict=True))
+            if chosen[robot] != IDLE and (there not in free or count[there] > 1 or (there, here) in movers)
+        ]
+        if not guilty:
+            return chosen
+        for robot in guilty:
+            chosen[robot] = IDLE
+
+
+def field_of_view(grid: Grid, positions: Sequence[Cell], goals: Sequence[Cell], robot: int, radius: int) -> Grid:
+    """What `robot` sees, (3, 2 * radius + 3, 2 * radius + 3): obstacles, own goal, robots.
+
+    The window of 2 * radius + 1 cells a side lies inside a ring of one cell. Outside the map is obstacle. A goal in
+    the window stands at its place; any other is projected on the ring along the line to it, half rounded to even.
+    """
+    free, (row, col) = free_cells(grid), positions[robot]
+    centre = radius + 1
+    view = np.zeros((3, 2 * centre + 1, 2 * centre + 1), bool)
+    for down in range(-radius, radius + 1):
+        for right in range(-radius, radius + 1):
+            cell = (row + down, col + right)
+            view[0, centre + down, centre + right] = cell not in free
+            view[2, centre + down, centre + right] = cell in positions
+    down, right = goals[robot][0] - row, goals[robot][1] - col
+    if max(abs(down), abs(right)) > radius:
+        shrink = Fraction(centre, max(abs(down), abs(right)))
+        down, right = round(down * shrink), round(right * shrink)
+    view[1, centre + down, centre + right] = True
+    return view
+
+
+def communication_graph(positions: Sequence[Cell], radius: float) -> npt.NDArray[np.float32]:
+    """(N, N), 1 where two different robots are strictly closer than `radius`."""
+    robots = range(len(positions))
+    hears = [[i != j and math.dist(positions[i], positions[j]) < radius for j in robots] for i in robots]
+    return np.array(hears, np.float32)
+
+
+def arrival(path: Sequence[Cell]) -> int:
+    """The time from which a robot stays in the last cell of its path."""
+    time = len(path) - 1
+    while time > 0 and path[time - 1] == path[-1]:
+        time -= 1
+    return time

@@ -1,0 +1,72 @@
+"""What a user may rely on once the package is installed."""
+
+import importlib.metadata
+import importlib.util
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import mapf_env
+
+ROOT = Path(__file__).parents[1]
+LEARNING_LIBRARIES = ("torch", "torchrl", "tensordict", "safetensors", "matplotlib", "tyro", "rich")
+
+
+def run_python(code: str) -> str:
+    """The output of a fresh interpreter that treats warnings as errors."""
+    command = [sys.executable, "-W", "error", "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+
+
+@pytest.mark.parametrize("package", ["mapf_env", "experts"])
+def test_world_and_teachers_import_no_learning_library(package: str) -> None:
+    loaded = run_python(f"import sys, {package}; print(*{{name.split('.')[0] for name in sys.modules}})").split()
+    assert package in loaded
+    assert not set(LEARNING_LIBRARIES) & set(loaded)
+
+
+def test_an_environment_runs_without_a_learning_library() -> None:
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('torch', 'torchrl'), None)); import mapf_env\n"
+        "env = mapf_env.parallel_env(num_agents=2); env.reset(seed=0)\n"
+        "print(len(env.step(dict.fromkeys(env.agents, 4))))"
+    )
+    assert run_python(code) == "5"
+
+
+def test_importing_again_registers_nothing_twice() -> None:
+    code = (
+        "import importlib, sys, mapf_env, pettingzoo; importlib.reload(mapf_env)\n"
+        "for name in [n for n in sys.modules if n.startswith('mapf_env') and n != 'mapf_env._native']:\n"
+        "    del sys.modules[name]\n"
+        "import mapf_env; print(*(r['mapf/grid-v0'].id for r in "
+        "(pettingzoo.parallel_registry, pettingzoo.aec_registry)))"
+    )
+    assert run_python(code) == "mapf/grid-v0 mapf/grid-v0"
+
+
+@pytest.mark.parametrize("package", ["mapf_env", "experts", "gnn_policy"])
+def test_type_checkers_find_our_types(package: str) -> None:
+    spec = importlib.util.find_spec(package)  # without importing: gnn_policy needs its extra
+    assert spec is not None
+    assert any((Path(folder) / "py.typed").is_file() for folder in spec.submodule_search_locations or [])
+
+
+def test_the_installed_version_is_the_sources() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert importlib.metadata.version("mapf-env") == project["version"]
+
+
+def test_the_world_needs_three_libraries() -> None:
+    needed = [line for line in importlib.metadata.requires("mapf-env") or [] if "extra ==" not in line]
+    names = {line.split(">")[0].split("=")[0].split(" ")[0] for line in needed}
+    assert names == {"numpy", "gymnasium", "pettingzoo"}
+
+
+def test_every_public_name_exists() -> None:
+    assert sorted(mapf_env.__all__, key=str.lower) == sorted(set(mapf_env.__all__), key=str.lower)
+    for name in mapf_env.__all__:
+        assert getattr(mapf_env, name) is not None
