@@ -30,8 +30,9 @@ class TrainConfig:
     """Columns of a map."""
     density: float = 0.1
     """Share of obstacles on a map."""
-    style: MapStyle = "cells"
-    """Obstacles: independent "cells", or short "walls" as the paper's released generator makes them."""
+    styles: tuple[MapStyle, ...] = ("cells",)
+    """Obstacles: independent "cells", or short "walls" as the paper's released generator makes them; the maps of a
+    split take turns among the styles."""
     train_maps: int = 420
     """Maps for training."""
     validation_maps: int = 90
@@ -145,7 +146,8 @@ class TrainConfig:
         """
         try:
             settings = json.loads(text)
-            return TrainConfig(**{**settings, "policy": PolicyConfig(**settings["policy"])})
+            nested = {"policy": PolicyConfig(**settings["policy"]), "styles": tuple(settings["styles"])}
+            return TrainConfig(**{**settings, **nested})
         except (json.JSONDecodeError, KeyError, TypeError) as damage:
             raise ValueError(f"no settings of this version of mapf-env ({damage})") from None
 
