@@ -48,7 +48,7 @@ class Command:
     """Columns of a map."""
     density: float | None = None
     """Share of obstacles."""
-    style: MapStyle | None = None
+    styles: tuple[MapStyle, ...] | None = None
     """Obstacles as independent "cells" or short "walls"."""
     data_seed: int | None = None
     """Of the maps and cases; any seed gives maps that training with it does not use."""
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         policy = checkpoint.load(command.run)
         variants = [Execution.parse(row) for row in command.rows]
-        names = ("height", "width", "density", "style", "data_seed", "w", "timeout", "seed")
+        names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         prefix = "validation_" if command.split == "validation" else ""
         if command.maps is not None:

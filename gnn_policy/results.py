@@ -92,7 +92,7 @@ def _settings(
 ) -> dict[str, Any]:
     """All that the numbers depend on."""
     maps, cases_per_map = config.size_of(split)
-    names = ("height", "width", "density", "style", "data_seed", "w", "timeout", "seed")
+    names = ("height", "width", "density", "data_seed", "w", "timeout", "seed")
     return {
         "policy": checkpoint.fingerprint(policy),
         "variants": [variant.name for variant in variants],
@@ -100,6 +100,7 @@ def _settings(
         "split": split,
         "maps": maps,
         "cases_per_map": cases_per_map,
+        "styles": list(config.styles),
         **{name: getattr(config, name) for name in names},
     }
 

@@ -20,7 +20,7 @@ def random_cases(seed=0, maps=6, num_agents=4, density=0.15):
         height=6,
         width=7,
         density=density,
-        style="cells",
+        styles=["cells"],
     )
 
 

@@ -24,7 +24,7 @@ CONFIG = TrainConfig(
 )
 
 CHANGES = """
-    --num-agents 2 5 --maps 2 --cases-per-map 3 --height 7 --width 8 --density 0.2 --style walls --data-seed 9 --w 1.5
+    --num-agents 2 5 --maps 2 --cases-per-map 3 --height 7 --width 8 --density 0.2 --styles walls --data-seed 9 --w 1.5
     --timeout 4 --seed 6 --threads 1 --rows stuck,0.5 argmax,pibt,connected
 """
 
@@ -74,7 +74,7 @@ def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path, split
     if split == "validation":
         size = {"validation_maps": 2, "validation_cases_per_map": 3}
     assert config == replace(
-        CONFIG, **size, height=7, width=8, density=0.2, style="walls", data_seed=9, w=1.5, timeout=4.0, seed=6
+        CONFIG, **size, height=7, width=8, density=0.2, styles=("walls",), data_seed=9, w=1.5, timeout=4.0, seed=6
     )
     assert how == {
         "num_agents": (2, 5),
@@ -101,7 +101,7 @@ def test_it_writes_numbers_and_an_animation(file, capsys):
 @pytest.mark.parametrize(
     ("changed", "named"),
     [
-        ("--style walls", "style"),
+        ("--styles walls", "styles"),
         ("--rows argmax", "variants"),
         ("--num-agents 2", "num_agents"),
         ("--split validation --maps 3 --cases-per-map 2", "split"),

@@ -67,7 +67,7 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
         "height": 5,
         "width": 5,
         "density": 0.0,
-        "style": "cells",
+        "styles": ["cells"],
         "data_seed": 0,
         "w": 1.1,
         "timeout": 3.0,

@@ -77,7 +77,7 @@ def test_a_team_of_robots_walks_the_paths_of_rollout(taps, sample, weights):
     """Views from the PettingZoo environment, actions to a slow world that shares only the shield."""
     policy = seeded_policy(1, taps=taps, comm_radius=3.0, comm_weights=weights)
     cases = make_cases(
-        "test", seed=3, maps=4, cases_per_map=1, num_agents=5, height=6, width=6, density=0.1, style="cells"
+        "test", seed=3, maps=4, cases_per_map=1, num_agents=5, height=6, width=6, density=0.1, styles=["cells"]
     )
     execution = Execution(sample=sample, temperature=0.7)
     seeds = []
