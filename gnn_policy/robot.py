@@ -76,6 +76,11 @@ class Robot:
         """How many messages it sends in a step: K - 1."""
         return self._policy.config.taps - 1
 
+    @property
+    def links(self) -> Mapping[Hashable, float]:
+        """The neighbours that it hears in this step and the weights of their links."""
+        return self._links
+
     def begin(self, view: npt.NDArray[Any], links: Mapping[Hashable, float], cell: tuple[int, int]) -> None:
         """Start a step.
 
