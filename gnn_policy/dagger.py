@@ -108,7 +108,10 @@ class Aggregator:
             config.rollout_teams,
             instances,
             fov_radius=config.policy.fov_radius,
+            extra_channels=("cost_to_go",) if config.policy.cost_to_go else (),
             comm_radius=config.policy.comm_radius,
+            comm_range=config.policy.comm_range,
+            comm_weights=config.policy.comm_weights,
             max_cycles=config.rollout_length,
             dtype="uint8",
         )
