@@ -136,7 +136,7 @@ def is_stuck(positions: Positions, goals: Positions, past: Positions) -> npt.NDA
         goals: (B, N, 2)
         past: (T, B, N, 2) at the T steps before; `STUCK_MEMORY` of them in play, fewer in the beginning.
     """
-    return (past == positions).all(-1).any(0) & (positions != goals).any(-1)
+    return np.logical_and((past == positions).all(-1).any(0), (positions != goals).any(-1))
 
 
 def hears_of(stuck: npt.NDArray[np.bool_], graph: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:

@@ -33,7 +33,8 @@ class Perception:
         comm_range: CommRange | None = None,
         comm_weights: CommWeights | None = None,
     ) -> None:
-        self._config, self._weights = config, comm_weights or config.comm_weights
+        self._config = config
+        self._weights: CommWeights = comm_weights or config.comm_weights
         self._radii = np.full(len(instances), config.comm_radius)
         if (comm_range or config.comm_range) == "connected":
             if config.comm_radius == 0:

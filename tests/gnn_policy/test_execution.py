@@ -1,6 +1,7 @@
 """Ways to execute a policy: names that round-trip, draws, and who is stuck, by a slow reader of the track."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,8 @@ def test_different_variants_have_different_names():
         [False, True, "stuck"], [0.5, 1.0], ["idle", "pibt"], ["fixed", "connected", None], ["binary", "distance", None]
     )
     fields = ("sample", "temperature", "shield", "comm_range", "comm_weights")
-    variants = [Execution(**dict(zip(fields, each, strict=True))) for each in choices]
+    settings: list[dict[str, Any]] = [dict(zip(fields, each, strict=True)) for each in choices]
+    variants = [Execution(**each) for each in settings]
     assert len({each.name for each in variants if each.sample}) == 2 * 2 * 2 * 9
     assert Execution().name == "argmax"
     assert Execution(sample=True, temperature=0.5, shield="pibt").name == "sampled,0.5,pibt"

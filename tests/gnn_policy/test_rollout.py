@@ -280,9 +280,9 @@ def test_sampled_moves_follow_the_tempered_softmax_and_argmax_its_mode(cases, po
         logits = policy(*observed(case, policy.config))[0]
     pad = policy.config.fov_radius
     obstacles = np.pad(case.grid.astype(np.float32), pad, constant_values=1)
-    shown = [np.repeat(each[None], 3000, 0) for each in (obstacles, case.starts, case.goals)]
-    past = np.empty((0, *shown[1].shape), np.int32)
-    teams = Teams(np.zeros(3000, np.intp), np.arange(3000, dtype=np.uint64), *shown, past, time=0)
+    maps, starts, goals = (np.repeat(each[None], 3000, 0) for each in (obstacles, case.starts, case.goals))
+    past = np.empty((0, *starts.shape), np.int32)
+    teams = Teams(np.zeros(3000, np.intp), np.arange(3000, dtype=np.uint64), maps, starts, goals, past, time=0)
     for temperature in (0.3, 1.0, 4.0):
         actor = PolicyActor(policy, [case], Execution(sample=True, temperature=temperature))
         moves = actor.act(teams).argmax(-1)
