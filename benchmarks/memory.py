@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -43,13 +44,15 @@ def batched(steps: int) -> Callable[[], None]:
 def pettingzoo(steps: int) -> Callable[[], None]:
     """One team by dictionaries; a share of `steps` steps at each call."""
     env, generator = parallel_env(num_agents=8, max_cycles=50), np.random.default_rng(0)
+    joint = [dict(zip(env.possible_agents, each, strict=True)) for each in generator.integers(0, 5, (997, 8)).tolist()]
+    endless = cycle(joint)  # lists of 10^5 random actions would make the process grow by themselves
     env.reset(seed=0)
 
     def play() -> None:
-        for actions in generator.integers(0, 5, (steps // SHARES, 8)).tolist():
+        for _ in range(steps // SHARES):
             if not env.agents:
                 env.reset()
-            env.step(dict(zip(env.agents, actions, strict=True)))
+            env.step(next(endless))
 
     return play
 

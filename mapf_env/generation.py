@@ -28,7 +28,7 @@ class Maze:
     corridor_width: int = 1
     """Cells, 1..9999."""
     loops: float = 0.1
-    """Share of the walls between two corridors that is opened beyond what connects them; 0 leaves one way everywhere."""
+    """Share of the walls between two corridors that is opened beyond what connects them; 0 leaves one way anywhere."""
 
     def __post_init__(self) -> None:
         _check_parts(self)

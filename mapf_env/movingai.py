@@ -236,4 +236,6 @@ def _beside(path: PathLike, map_name: str) -> Path:
     for candidate in (folder / map_name, folder / parts, folder / parts.name):
         if os.path.isfile(candidate):  # False for what can be no file's name too
             return candidate
-    raise FileNotFoundError(f"{path}, line 2 names the map {map_name!r}, which is not beside it: put it there or give map_path")
+    raise FileNotFoundError(
+        f"{path}, line 2 names the map {map_name!r}, which is not beside it: put it there or give map_path"
+    )

@@ -120,7 +120,9 @@ def test_pibt_never_collides_and_the_first_gets_what_it_wants(
 
 @given(strategies.crowds(max_side=6), st.data())
 @hypothesis_settings(max_examples=300)
-def test_pibt_is_the_algorithm_of_its_paper(crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject) -> None:
+def test_pibt_is_the_algorithm_of_its_paper(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject
+) -> None:
     """Priorities and preferences without ties leave nothing to the lot, so the whole joint action is known."""
     grid, team = crowd
     under_way = data.draw(st.permutations(range(len(team))))
@@ -282,6 +284,51 @@ def test_lifelong_goals_are_reachable_distinct_and_uniform() -> None:
             counts[tuple(env.goals[0, i])] += 1
     assert counts.sum() == throughput > 400
     assert counts.min() > 0.5 * counts.mean()
+
+
+def test_lifelong_goals_stay_in_the_region_of_their_robot() -> None:
+    parted = Instance([[0, 0, 0, 1, 0, 0, 0]], [[0, 0], [0, 4]], [[0, 1], [0, 5]])
+    env = BatchedEnv(1, num_agents=2, height=1, width=7, density=0.0, task="lifelong", max_cycles=10**6)
+    env.reset(seed=0, instances=[parted])
+    generator, arrivals = np.random.default_rng(0), 0
+    for _ in range(300):
+        arrivals += int(env.step(generator.choice([1, 3], (1, 2))).arrived.sum())
+        assert (env.goals[0, :, 1] // 4 == [0, 1]).all()
+    assert arrivals > 20
+
+
+@given(strategies.crowds(max_side=5), st.data(), strategies.seeds)
+def test_new_goals_are_as_defined(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, seed: int
+) -> None:
+    """They are reachable, nobody's goal and not where the robot stands; without such a cell the goal stays."""
+    grid, team = crowd
+    arrived = np.array([data.draw(st.lists(st.booleans(), min_size=len(team), max_size=len(team)))])
+    goals = [data.draw(st.permutations(sorted(oracles.free_cells(grid))))[: len(team)]]
+    maps, positions = rules.bordered(grid[None], 1), np.array([team], np.int32)
+    counts, seeds = np.ones((1, len(team)), np.int32), np.array([seed], np.uint64)
+    drawn = rules.draw_goals(maps, 1, positions, np.array(goals, np.int32), arrived, counts, seeds)
+    left = list(goals[0])
+    for robot, new in enumerate(oracles.cells(drawn[0])):
+        possible = set(oracles.distances(grid, team[robot])) - set(left) - {team[robot]}
+        if arrived[0, robot] and possible:
+            assert new in possible
+        else:
+            assert new == left[robot]
+        left[robot] = new
+
+
+def test_edges_of_a_batch_are_those_of_its_teams() -> None:
+    env = BatchedEnv(3, num_agents=7, height=8, width=8, comm_weights="distance", message_loss=0.3)
+    graph = env.reset(seed=2).graph
+    edges, expected = env.edges(graph), []
+    for b in range(3):
+        for i in range(7):
+            for j in range(7):
+                if graph[b, i, j]:
+                    expected.append((b, i, j, graph[b, i, j], *(env.positions[b, j] - env.positions[b, i]).tolist()))
+    assert [(*row[:4], *row[4].tolist()) for row in zip(*edges, strict=True)] == expected
+    assert len({row[0] for row in expected}) == 3
 
 
 def test_a_lifelong_robot_without_a_free_cell_keeps_its_goal() -> None:

@@ -7,13 +7,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import readers
-from mapf_env import Instance, parse_instance
+from mapf_env import parse_instance
 
-TOKENS = (
-    b"-1 0 00 1 3 4 9 1.5 nan inf 1e400 0x1 99999999999 " + b"7" * 5000 + b" type octile height width map version "
-    b". @ G T \t \r \0 \n \xef\xbb\xbf \xff \xd9\xa3 .. / a.map read.scen " + b"m" * 300 + b" [ ] { } , : \" null true "
-    b"[] [[0,0]] [[0.5,0]] [[1,2,3]] {} starts goals sha256 maps instances [[9223372036854775808,0]]"
-).split(b" ") + [b" ", b""]
+TOKENS = [
+    b"",
+    b" ",
+    *(
+        b"-1 0 00 1 3 4 9 1.5 nan inf 1e400 0x1 99999999999 " + b"7" * 5000 + b" type octile height width map version "
+        b". @ G T \t \r \0 \n \xef\xbb\xbf \xff \xd9\xa3 .. / a.map read.scen "
+        + b"m"
+        * 300
+        + b' [ ] { } , : " null true '
+        b"[] [[0,0]] [[0.5,0]] [[1,2,3]] {} starts goals sha256 maps instances [[9223372036854775808,0]]"
+    ).split(b" "),
+]
 
 
 @st.composite
@@ -52,8 +59,6 @@ def test_sound_files_are_read(kind: str, tmp_path: Path) -> None:
 def test_drawings_are_read_soundly_or_refused(drawing: str) -> None:
     try:
         instance = parse_instance(drawing)
-    except ValueError as error:
-        assert str(error)
-    else:
-        assert isinstance(instance, Instance)
-        assert readers.unsound(instance) == []
+    except ValueError:
+        return
+    assert readers.unsound(instance) == []
