@@ -16,7 +16,7 @@ from gnn_policy.command_line import mistakes_in_one_line
 from gnn_policy.config import RECIPES, Recipe, TrainConfig
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.results import examine
-from gnn_policy.training import Training, split_cases
+from gnn_policy.training import Training
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Command:
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     recipe: Recipe = "quick"
-    """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "paper" is
-    the paper's setup."""
+    """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "full" is
+    that of the policies that come with the package, "paper" the paper's setup."""
     run: Path | None = None
     """The run folder; runs/RECIPE if not given."""
 
@@ -66,16 +66,7 @@ def _train(config: TrainConfig, folder: Path, console: Console) -> None:
     except KeyboardInterrupt:
         console.print(f"stopped; the same command goes on after round {len(training.history)}", highlight=False)
         raise SystemExit(130) from None
-    examine(
-        checkpoint.load(folder),
-        {f"{config.num_agents} robots, {config.test_maps} held-out maps": split_cases(config, "test")},
-        folder,
-        console,
-        w=config.w,
-        timeout=config.timeout,
-        seed=config.seed,
-        threads=training.threads,
-    )
+    examine(checkpoint.load(folder), config, folder, console, threads=training.threads)
     console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
     console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)
 

@@ -42,11 +42,7 @@ from mapf_env.files import remove_drafts, replacing
 
 def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None) -> list[Instance]:
     """The cases of one split as the settings define them."""
-    maps, cases = {
-        "train": (config.train_maps, config.cases_per_map),
-        "validation": (config.validation_maps, config.validation_cases_per_map),
-        "test": (config.test_maps, config.cases_per_map),
-    }[split]
+    maps, cases = config.size_of(split)
     return make_cases(
         split,
         seed=config.data_seed,
@@ -56,7 +52,7 @@ def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None
         height=config.height,
         width=config.width,
         density=config.density,
-        style=config.style,
+        styles=config.styles,
     )
 
 
@@ -127,9 +123,7 @@ class Training:
         """Train all remaining rounds."""
         config = self.config
         exam = evaluation.Exam.prepare(self._validation, w=config.w, timeout=config.timeout, threads=self.threads)
-        batches = BatchMaker(
-            self._instances, config.policy.fov_radius, config.policy.comm_radius, augment=config.augment
-        )
+        batches = BatchMaker(self._instances, config.policy, augment=config.augment)
         aggregator = Aggregator(config, self.policy, self._instances, self.threads)
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history))
         try:
