@@ -12,7 +12,7 @@ from gnn_policy.network import PolicyConfig
 from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
-Recipe = Literal["quick", "paper"]
+Recipe = Literal["quick", "full", "paper"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,8 +30,9 @@ class TrainConfig:
     """Columns of a map."""
     density: float = 0.1
     """Share of obstacles on a map."""
-    style: MapStyle = "cells"
-    """Obstacles: independent "cells", or short "walls" as the paper's released generator makes them."""
+    styles: tuple[MapStyle, ...] = ("cells",)
+    """Obstacles: independent "cells", or short "walls" as the paper's released generator makes them; the maps of a
+    split take turns among the styles."""
     train_maps: int = 420
     """Maps for training."""
     validation_maps: int = 90
@@ -145,7 +146,8 @@ class TrainConfig:
         """
         try:
             settings = json.loads(text)
-            return TrainConfig(**{**settings, "policy": PolicyConfig(**settings["policy"])})
+            nested = {"policy": PolicyConfig(**settings["policy"]), "styles": tuple(settings["styles"])}
+            return TrainConfig(**{**settings, **nested})
         except (json.JSONDecodeError, KeyError, TypeError) as damage:
             raise ValueError(f"no settings of this version of mapf-env ({damage})") from None
 
@@ -154,21 +156,34 @@ class TrainConfig:
         return json.dumps(asdict(self), indent=2) + "\n"
 
 
+_QUICK = TrainConfig(
+    policy=PolicyConfig(encoder="lean"),
+    train_maps=2000,
+    cases_per_map=10,
+    validation_cases_per_map=5,
+    epochs=36,
+    updates_per_epoch=800,
+    batch_size=32,
+    demonstration_steps=32_768,
+    dagger_every=1,
+    dagger_steps=16_384,
+    fresh_share=0.75,
+    augment=True,
+    lr=2e-3,
+)
+
 RECIPES: dict[Recipe, TrainConfig] = {
-    "paper": TrainConfig(),
-    "quick": replace(
-        TrainConfig(policy=PolicyConfig(encoder="lean")),
-        train_maps=2000,
-        cases_per_map=10,
-        validation_cases_per_map=5,
-        epochs=40,
-        updates_per_epoch=800,
-        batch_size=32,
-        demonstration_steps=32_768,
-        dagger_every=1,
-        dagger_steps=8192,
-        fresh_window=32_768,
-        augment=True,
+    "quick": _QUICK,
+    "full": replace(
+        _QUICK,
+        styles=("cells", "walls"),
+        train_maps=4000,
+        cases_per_map=20,
+        validation_cases_per_map=10,
+        epochs=60,
+        validate_every=10,
     ),
+    "paper": TrainConfig(),
 }
-"""Complete sets of settings: the paper's, and one that takes about ten minutes on two CPU cores."""
+"""Complete sets of settings: one that takes about ten minutes on two CPU cores, that of the policies that come with the
+package, and the paper's."""

@@ -49,12 +49,16 @@ class Teacher:
         )
 
     def label(self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]) -> tuple[Demonstrations, int]:
-        """Demonstrations of the distinct states among the given ones, in their order, and how many are unsolved."""
+        """Demonstrations of the given states, in their order, and how many the expert could not solve.
+
+        A state that was visited often counts as often, so states where teams are stuck weigh more; it is solved once.
+        """
         rows = np.column_stack([cases, positions.reshape(len(cases), -1)]).astype(np.int32)
-        _, first = np.unique(rows.view(np.dtype((np.void, rows.strides[0]))).ravel(), return_index=True)
-        first.sort()
-        cases, positions = cases[first], positions[first]
-        actions, solved = self.moves(cases, positions)
+        _, first, which = np.unique(
+            rows.view(np.dtype((np.void, rows.strides[0]))).ravel(), return_index=True, return_inverse=True
+        )
+        actions, solved = self.moves(cases[first], positions[first])
+        actions, solved = actions[which], solved[which]
         labelled = Demonstrations(
             cases[solved].astype(np.int32), positions[solved].astype(np.int16), actions[solved].astype(np.int8)
         )
@@ -123,7 +127,7 @@ class Aggregator:
         """Play at least `steps` team steps and label them; what a round yields depends on its number and the weights.
 
         Returns:
-            The demonstrations of all distinct states of the round, and the number of those the expert could not solve.
+            The demonstrations of all states of the round, and the number of those the expert could not solve.
         """
         seed = int(np.random.SeedSequence([self._config.seed, round_number]).generate_state(1)[0])
         self._env.set_seed(seed)

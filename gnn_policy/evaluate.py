@@ -41,7 +41,7 @@ class Command:
     """Columns of a map."""
     density: float | None = None
     """Share of obstacles."""
-    style: MapStyle | None = None
+    styles: tuple[MapStyle, ...] | None = None
     """Obstacles as independent "cells" or short "walls"."""
     data_seed: int | None = None
     """Of the maps and cases; any seed gives maps that training with it does not use."""
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         policy = checkpoint.load(command.run)
         given = {
             name: value
-            for name in ("cases_per_map", "height", "width", "density", "style", "data_seed", "w", "timeout", "seed")
+            for name in ("cases_per_map", "height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
             if (value := getattr(command, name)) is not None
         }
         if command.maps is not None:

@@ -28,8 +28,8 @@ class Command:
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     recipe: Recipe = "quick"
-    """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "paper" is
-    the paper's setup."""
+    """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "full" is
+    that of the policies that come with the package, "paper" the paper's setup."""
     run: Path | None = None
     """The run folder; runs/RECIPE if not given."""
 

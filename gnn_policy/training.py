@@ -56,7 +56,7 @@ def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None
         height=config.height,
         width=config.width,
         density=config.density,
-        style=config.style,
+        styles=config.styles,
     )
 
 

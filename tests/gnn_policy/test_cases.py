@@ -13,7 +13,7 @@ SETTINGS = {
     "height": 12,
     "width": 9,
     "density": 0.2,
-    "style": "cells",
+    "styles": ["cells"],
 }
 SPLITS = ("train", "validation", "test")
 
@@ -27,10 +27,19 @@ def test_no_two_splits_or_seeds_share_a_map(style):
     seen = set()
     for seed in (0, 1, 2**40):
         for split in SPLITS:
-            grids = set(maps_of(make_cases(split, **{**SETTINGS, "style": style, "seed": seed})))
+            grids = set(maps_of(make_cases(split, **{**SETTINGS, "styles": [style], "seed": seed})))
             assert len(grids) == SETTINGS["maps"]
             assert not grids & seen
             seen |= grids
+
+
+def test_maps_take_turns_among_the_styles():
+    both = maps_of(make_cases("train", **{**SETTINGS, "styles": ["walls", "cells"]}))
+    walls, cells = (maps_of(make_cases("train", **{**SETTINGS, "styles": [style]})) for style in ("walls", "cells"))
+    assert set(walls).isdisjoint(cells)
+    assert both[0::4] + both[1::4] == walls[0::4] + walls[1::4]
+    assert both[2::4] + both[3::4] == cells[2::4] + cells[3::4]
+    assert maps_of(make_cases("train", **{**SETTINGS, "maps": 1, "styles": ["walls", "cells"]})) == walls[:2]
 
 
 def test_equal_settings_give_equal_cases():
@@ -63,7 +72,8 @@ def test_more_maps_or_cases_keep_the_first_ones():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"maps": 0}, {"cases_per_map": 0}, {"density": 1.0}, {"density": 0.99}, {"num_agents": 100}]
+    "wrong",
+    [{"maps": 0}, {"cases_per_map": 0}, {"density": 1.0}, {"density": 0.99}, {"num_agents": 100}, {"styles": []}],
 )
 def test_settings_without_room_are_refused(wrong):
     with pytest.raises(ValueError, match=r"\w+ \w+"):

@@ -28,7 +28,7 @@ CONFIG = TrainConfig(
 @pytest.fixture(scope="module")
 def cases():
     return make_cases(
-        "train", seed=0, maps=6, cases_per_map=2, num_agents=4, height=7, width=6, density=0.15, style="cells"
+        "train", seed=0, maps=6, cases_per_map=2, num_agents=4, height=7, width=6, density=0.15, styles=["cells"]
     )
 
 
@@ -65,7 +65,7 @@ def test_round_zero_is_the_expert_itself(cases, policy):
     assert unsolved == 0
     assert_labels_are_the_experts(cases, states, w=CONFIG.w, node_limit=CONFIG.expert_nodes)
     known = {(int(c), p.tobytes()) for c, p in zip(states.cases, states.positions.astype(np.int32), strict=True)}
-    assert len(known) == len(states), "a state occurs twice"
+    assert len(known) < len(states) == 5 * 24 * 3
     assert set(states.cases.tolist()) == set(range(len(cases)))
     for case in set(states.cases.tolist()):
         assert (case, cases[case].starts.tobytes()) in known
@@ -103,8 +103,6 @@ def test_later_rounds_visit_what_the_policy_does_and_label_what_the_expert_would
     expert_states = {(int(c), p.tobytes()) for c, p in zip(expert_only.cases, expert_only.positions, strict=True)}
     visited = {(int(c), p.tobytes()) for c, p in zip(states.cases, states.positions, strict=True)}
     assert visited - expert_states
-    keys = [(int(c), p.tobytes()) for c, p in zip(states.cases, states.positions, strict=True)]
-    assert len(set(keys)) == len(keys)
 
 
 def test_collection_plays_the_weights_of_the_moment(cases, policy):
@@ -119,6 +117,7 @@ def test_collection_plays_the_weights_of_the_moment(cases, policy):
     idle, _ = aggregator.collect(1, 1)
     aggregator.close()
     assert {p.tobytes() for p in idle.positions} <= {each.starts.astype(np.int16).tobytes() for each in cases}
+    assert len(idle) == len(before), "where a team is stuck counts once for each step"
 
 
 @pytest.mark.parametrize("sample", [False, True])
@@ -178,7 +177,7 @@ def test_sampled_moves_follow_the_softmax(cases, policy):
 
 def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
     crowded = make_cases(
-        "train", seed=1, maps=2, cases_per_map=4, num_agents=11, height=4, width=4, density=0.0, style="cells"
+        "train", seed=1, maps=2, cases_per_map=4, num_agents=11, height=4, width=4, density=0.0, styles=["cells"]
     )
     teacher = Teacher(crowded, w=1.0, node_limit=3, threads=1)
     positions = np.stack([each.starts for each in crowded])
@@ -188,14 +187,15 @@ def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
     assert unsolved == solved.count(False)
     assert states.cases.tolist() == [i for i in range(8) if solved[i]]
     twice, counted = teacher.label(np.tile(np.arange(8), 2), np.tile(positions, (2, 1, 1)))
-    assert (len(twice), counted) == (len(states), unsolved)
+    assert (len(twice), counted) == (2 * len(states), 2 * unsolved)
 
 
 def test_labels_keep_the_order_of_the_visits(cases):
     teacher = Teacher(cases, w=1.05, node_limit=2000, threads=1)
     order = np.array([7, 2, 7, 9, 0, 2])
     states, _ = teacher.label(order, np.stack([cases[i].starts for i in order]))
-    assert states.cases.tolist() == [7, 2, 9, 0]
+    assert states.cases.tolist() == order.tolist()
+    assert_labels_are_the_experts(cases, states, w=1.05, node_limit=2000)
 
 
 def test_the_mixture_reads_what_the_environment_writes(policy, cases):

@@ -32,7 +32,7 @@ def random_states(shape, count=40, seed=0):
         height=shape[0],
         width=shape[1],
         density=0.15,
-        style="cells",
+        styles=["cells"],
     )
     chosen = generator.integers(len(cases), size=count)
     positions = np.stack([generator.permutation(np.argwhere(~cases[i].grid))[:3] for i in chosen])

@@ -23,7 +23,7 @@ CONFIG = TrainConfig(
 )
 
 CHANGES = """
-    --num-agents 2 5 --maps 2 --cases-per-map 3 --height 7 --width 8 --density 0.2 --style walls --data-seed 9 --w 1.5
+    --num-agents 2 5 --maps 2 --cases-per-map 3 --height 7 --width 8 --density 0.2 --styles walls --data-seed 9 --w 1.5
     --timeout 4 --temperature 0.5 --seed 6 --threads 1
 """
 
@@ -70,7 +70,9 @@ def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path):
         *CHANGES.split(),
         *("--out", str(tmp_path / "out")),
     )
-    changed = replace(CONFIG, test_maps=2, cases_per_map=3, height=7, width=8, density=0.2, style="walls", data_seed=9)
+    changed = replace(
+        CONFIG, test_maps=2, cases_per_map=3, height=7, width=8, density=0.2, styles=("walls",), data_seed=9
+    )
     assert list(instances.values()) == [evaluate.split_cases(changed, "test", n) for n in (2, 5)]
     assert how == {"w": 1.5, "timeout": 4.0, "seed": 6, "threads": 1, "temperature": 0.5}
     assert torch.get_num_threads() == 1

@@ -126,7 +126,7 @@ def compared():
     torch.manual_seed(0)
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))
     cases = make_cases(
-        "test", seed=0, maps=5, cases_per_map=3, num_agents=4, height=6, width=6, density=0.1, style="cells"
+        "test", seed=0, maps=5, cases_per_map=3, num_agents=4, height=6, width=6, density=0.1, styles=["cells"]
     )
     exam = Exam.prepare(cases, w=1.05, timeout=3.0, threads=1)
     phases = []

@@ -35,7 +35,7 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
     torch.manual_seed(0)
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))
     cases = make_cases(
-        "test", seed=0, maps=2, cases_per_map=2, num_agents=2, height=5, width=5, density=0.0, style="cells"
+        "test", seed=0, maps=2, cases_per_map=2, num_agents=2, height=5, width=5, density=0.0, styles=["cells"]
     )
     console = Console(file=io.StringIO(), width=80)
     how = {"w": 1.1, "timeout": 3.0, "seed": 0, "threads": 1}

@@ -27,7 +27,7 @@ def random_cases(seed=0, maps=6, num_agents=4, height=6, width=7, density=0.15, 
         height=height,
         width=width,
         density=density,
-        style="cells",
+        styles=["cells"],
     )
 
 

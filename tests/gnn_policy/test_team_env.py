@@ -19,7 +19,7 @@ SETTINGS = {"num_agents": 3, "height": 6, "width": 5, "fov_radius": 2, "comm_rad
 @pytest.fixture(scope="module")
 def cases():
     return make_cases(
-        "train", seed=0, maps=5, cases_per_map=2, num_agents=3, height=6, width=5, density=0.1, style="cells"
+        "train", seed=0, maps=5, cases_per_map=2, num_agents=3, height=6, width=5, density=0.1, styles=["cells"]
     )
 
 

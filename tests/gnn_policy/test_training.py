@@ -325,7 +325,7 @@ def arguments_for(config, folder):
             if isinstance(setting, bool):
                 flags.append(flag if setting else f"--no-{option.replace('_', '-')}")
             else:
-                flags += [flag, str(setting)]
+                flags += [flag, *map(str, setting if isinstance(setting, tuple) else (setting,))]
     return flags
 
 
