@@ -61,8 +61,8 @@ class Ranks:
         return tensor
 
     def average_gradients(self, module: nn.Module) -> nn.Module:
-        """`module` whose backward pass averages gradients; statistics of batch norm stay each process's own."""
-        return DistributedDataParallel(module, broadcast_buffers=False) if self.count > 1 else module
+        """`module` whose backward pass averages gradients; batch norm's statistics follow those of process 0."""
+        return DistributedDataParallel(module) if self.count > 1 else module
 
 
 @contextmanager

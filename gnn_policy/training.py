@@ -20,6 +20,7 @@ from __future__ import annotations
 import csv
 import pickle
 import time
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from gnn_policy import checkpoint, evaluation
 from gnn_policy.cases import Split, make_cases
 from gnn_policy.command_line import cpu_threads
 from gnn_policy.config import TrainConfig
-from gnn_policy.dagger import Aggregator
+from gnn_policy.dagger import Aggregator, Teacher
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.imitation import ImitationLoss
 from gnn_policy.learning_curve import Round, draw_learning_curve
@@ -93,12 +94,25 @@ def open_run(folder: Path, config: TrainConfig) -> None:
 class Training:
     """A training run in its folder; `run` goes on from the last finished round.
 
+    Args:
+        config: Its settings.
+        folder: Its folder.
+        progress: Told what goes on.
+        clock: What seconds are measured by; `time.process_time` where the machine is shared.
+
     Raises:
         ValueError: If settings do not fit together, or a file of the run is damaged.
         FileExistsError: If the folder holds something else than an unfinished run with these settings.
     """
 
-    def __init__(self, config: TrainConfig, folder: Path, progress: TrainingProgress, ranks: Ranks = Ranks()) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        folder: Path,
+        progress: TrainingProgress,
+        ranks: Ranks = Ranks(),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.config, self.folder, self.progress, self.ranks = config, folder, progress, ranks
         ranks.share("batch_size", config.batch_size)
         ranks.share("rollout_teams", config.rollout_teams)
@@ -117,9 +131,18 @@ class Training:
         self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.epochs, config.final_lr)
         self.history: list[Round] = []
         self._seconds_before = 0.0
-        self._began = time.monotonic()
+        self._clock, self._began = clock, clock()
         self._instances = split_cases(config, "train")
         self._validation = split_cases(config, "validation")
+        self._teacher = Teacher(
+            self._instances,
+            solver=config.teacher,
+            w=config.w,
+            ties=config.ties,
+            node_limit=config.expert_nodes,
+            threads=self.threads,
+            clock=clock,
+        )
         self._shards: list[Demonstrations] = []
         found: dict[str, Any] | None = None
         if ranks.rank == 0:
@@ -142,7 +165,7 @@ class Training:
             else None
         )
         batches = BatchMaker(self._instances, config.policy, augment=config.augment)
-        aggregator = Aggregator(config, self.policy, self._instances, self.threads, self.ranks)
+        aggregator = Aggregator(config, self.policy, self._teacher, self._instances, self.ranks)
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         try:
             for number in range(len(self.history), config.epochs):
@@ -162,7 +185,7 @@ class Training:
 
     def _round(self, number: int, aggregator: Aggregator, batches: BatchMaker, exam: evaluation.Exam | None) -> Round:
         config = self.config
-        began, unlabelled = time.monotonic(), 0
+        began, taught, unlabelled = self._clock(), self._teacher.seconds, 0
         if self._collects(number):
             self.progress.phase(number, "collecting")
             steps = config.dagger_steps if number else config.demonstration_steps
@@ -176,11 +199,11 @@ class Training:
         self._shards = [demonstrations]
         if len(demonstrations) == 0:
             raise ValueError("the expert solved none of the visited states: raise expert_nodes or make cases easier")
-        between = time.monotonic()
+        between = self._clock()
         lr = float(self.scheduler.get_last_lr()[0])
         loss, accuracy, updates = self._fit(number, demonstrations, batches)
         self.scheduler.step()
-        done = time.monotonic()
+        done = self._clock()
         previous = self.history[-1] if self.history else None
         row = Round(
             round=number,
@@ -188,6 +211,7 @@ class Training:
             samples=updates * config.batch_size * config.num_agents + (previous.samples if previous else 0),
             seconds=0.0,
             collect_seconds=between - began,
+            expert_seconds=self._teacher.seconds - taught,
             fit_seconds=done - between,
             loss=loss,
             accuracy=accuracy,
@@ -198,7 +222,7 @@ class Training:
         if exam is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.epochs):
             self.progress.phase(number, "validation")
             self._validate(row, exam)
-        row.seconds = self._seconds_before + time.monotonic() - self._began
+        row.seconds = self._seconds_before + self._clock() - self._began
         return row
 
     def _collects(self, number: int) -> bool:
@@ -222,15 +246,10 @@ class Training:
             self.optimizer.step()
             losses[update], accuracies[update] = outcome["loss_imitation"].item(), outcome["accuracy"].item()
             self.progress.fitted(number, update + 1, updates, losses[: update + 1], robots)
-        self._agree_on_statistics()
+        if self.ranks.count > 1:  # the last batch's statistics are each process's own
+            self.policy.load_state_dict(self.ranks.from_first(self.policy.state_dict()))
         means = self.ranks.average(torch.tensor([losses.mean(), accuracies.mean()])).tolist()
         return means[0], means[1], updates
-
-    def _agree_on_statistics(self) -> None:
-        """Batch norm saw a part of each batch in each process: the policy that plays has the means."""
-        for buffer in self.policy.buffers():
-            if buffer.is_floating_point():
-                self.ranks.average(buffer)
 
     def _pass(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[npt.NDArray[np.intp]]:
         """Every state once, in random order."""
