@@ -34,6 +34,6 @@ def setup(app):
 
     def dash(app, what, name, subject, options, lines):
         if what in ("attribute", "property", "data") and lines:
-            lines[0] = lines[0].replace(": ", " – ", 1)
+            lines[0] = lines[0].replace(": ", " \u2013 ", 1)
 
     app.connect("autodoc-process-docstring", dash, priority=400)
