@@ -77,7 +77,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self.action_spaces = {agent: copy.deepcopy(moves) for agent in self.possible_agents}
         self.state_space = spaces.Box(0.0, 1.0, (3, H, W), np.float32)
         self._masks_shape = (N, 5)
-        self._memory = _native.MemoryFloat32 if config.dtype == "float32" else _native.MemoryUint8
+        self._memory: Any = _native.MemoryFloat32 if config.dtype == "float32" else _native.MemoryUint8
         self._reused: _Reused | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -213,8 +213,11 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
 
     def _fresh(
         self, fov: npt.NDArray[Any], graph: npt.NDArray[np.float32]
-    ) -> tuple[dict[str, Any], dict[str, Any], _native.MemoryFloat32 | _native.MemoryUint8]:
-        """Observations and infos by agent, whose arrays are rows of (1, N, C, F, F), (1, N, N) and masks (N, 5)."""
+    ) -> tuple[dict[str, Any], dict[str, Any], Any]:
+        """Observations and infos by agent, whose arrays are rows of (1, N, C, F, F), (1, N, N) and masks (N, 5).
+
+        And these as memory for the stepper, of its dtype.
+        """
         agents, rows = self.possible_agents, _native.rows_by_agent
         masks = np.empty(self._masks_shape, np.int8)
         names, columns = (("fov", "graph"), (fov[0], graph[0])) if self._observation == "dict" else ((), (fov[0],))

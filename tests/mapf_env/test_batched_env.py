@@ -48,6 +48,8 @@ def assert_equal(one: Any, other: Any) -> None:
         assert len(one) == len(other)
         for a, b in zip(one, other, strict=True):
             assert_equal(a, b)
+    elif one is None:
+        assert other is None
     else:
         assert one.dtype == other.dtype
         assert np.array_equal(one, other)
