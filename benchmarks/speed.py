@@ -181,8 +181,10 @@ def compiled_bare_loop() -> Path:
 def threads_table(options: Options, program: Path | None) -> Table:
     """Two threads beside one, by wall-clock time, and a thousand robots on a large map beside the largest team.
 
-    The environments take turns of a few steps, and the best turn of each counts.
+    The environments take turns of some milliseconds, and the best turn of each counts. A worker sleeps while it is not
+    its environment's turn; short turns would measure how it is woken.
     """
+    turn_steps = 128
     largest = max(options.num_agents)
 
     def stepper(num_agents: int, num_envs: int, **settings: Any) -> Callable[[], float]:
@@ -193,9 +195,9 @@ def threads_table(options: Options, program: Path | None) -> Table:
 
         def turn() -> float:
             began = time.perf_counter()
-            for _ in range(16):
+            for _ in range(turn_steps):
                 env.step(next(actions), out=out)
-            return 16 * num_envs * num_agents / (time.perf_counter() - began)
+            return turn_steps * num_envs * num_agents / (time.perf_counter() - began)
 
         return turn
 
