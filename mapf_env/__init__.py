@@ -8,7 +8,7 @@ import pettingzoo
 from mapf_env.ascii_map import parse_instance, parse_map
 from mapf_env.batched_env import BatchedEnv, Observation, Step
 from mapf_env.config import EnvConfig
-from mapf_env.generation import random_cases, random_instance, random_map, random_maps
+from mapf_env.generation import Maze, Rooms, Warehouse, random_cases, random_instance, random_map, random_maps
 from mapf_env.grid_v0 import ENV_ID, GridEnv, env, parallel_env
 from mapf_env.instance import Instance
 from mapf_env.instance_set import instance_hash, load_instances, save_instances
@@ -31,11 +31,14 @@ __all__ = [
     "GridEnv",
     "Instance",
     "JointEnv",
+    "Maze",
     "Observation",
     "Rewards",
+    "Rooms",
     "Scene",
     "Solution",
     "Step",
+    "Warehouse",
     "animate",
     "communication_edges",
     "communication_graph",

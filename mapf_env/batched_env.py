@@ -198,7 +198,10 @@ class BatchedEnv:
     ) -> None:
         state, config, pad = self._state, self.config, self.config.fov_radius
         episodes = state.episodes[chosen] if streams is None else np.zeros_like(chosen, np.uint64)
-        streams = state.streams[chosen] if streams is None else streams
+        if streams is None:
+            streams, new = state.streams[chosen], ~state.started[chosen]
+            if new.any():  # drawn no sooner than here, so that copies of an environment not yet begun differ
+                streams[new] = np.random.SeedSequence().generate_state(int(new.sum()), np.uint64)
         seeds = _native.mix(streams, episodes)
         if instances is None and self._cases is not None:
             draws = _native.mix(seeds, np.full_like(seeds, np.iinfo(np.uint64).max)) % np.uint64(len(self._cases))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import sys
+import time
 from operator import index
 from typing import Any, Literal, SupportsIndex
 
@@ -35,7 +37,8 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
             shield="pibt".
         reuse_buffers: Return the same dictionaries and arrays at every step, overwritten; faster, for loops that keep
             nothing.
-        render_mode: "ansi" gives text, "rgb_array" a picture (H', W', 3), "human" prints the text at each step.
+        render_mode: "ansi" gives text, "rgb_array" a picture (H', W', 3), "human" prints the text at each step; in a
+            terminal each state takes the place of the one before, `metadata["render_fps"]` times a second.
         settings: Fields of `mapf_env.EnvConfig`.
     """
 
@@ -78,6 +81,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self.state_space = spaces.Box(0.0, 1.0, (3, H, W), np.float32)
         self._masks_shape = (N, 5)
         self._reused: _Reused | None = None
+        self._shown_lines = 0
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_reused": None}  # its dictionaries share the memory of its arrays
@@ -207,8 +211,16 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         shown = text(self.grid, self.positions, self.goals)
         if self.render_mode == "ansi":
             return shown
-        print(shown)
+        self._show(shown)
         return None
+
+    def _show(self, shown: str) -> None:
+        terminal = sys.stdout.isatty()
+        if terminal and self._shown_lines:
+            time.sleep(1 / self.metadata["render_fps"])
+            print(f"\x1b[{self._shown_lines}F\x1b[J", end="")  # up to the first line of the picture before, and clear
+        print(shown, flush=True)
+        self._shown_lines = shown.count("\n") + 1
 
     def close(self) -> None:
         """Nothing to release."""

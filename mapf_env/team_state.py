@@ -66,12 +66,12 @@ class TeamState:
 
     @staticmethod
     def empty(num_envs: int, config: EnvConfig) -> TeamState:
-        """Before the first reset; the streams are seeded at random."""
+        """Before the first reset."""
         B, N, border = num_envs, config.num_agents, 2 * config.fov_radius
         padded = config.height + border, config.width + border
         size = padded[0] * padded[1]
         return TeamState(
-            streams=np.array(np.random.SeedSequence().generate_state(B, np.uint64), np.uint64),
+            streams=np.zeros(B, np.uint64),
             episodes=np.zeros(B, np.uint64),
             seeds=np.zeros(B, np.uint64),
             grids=np.ones((B, config.height, config.width), np.bool_),

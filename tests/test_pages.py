@@ -1,12 +1,19 @@
 """The code of README and docs runs as it stands there, block after block of a page.
 
-Long commands are parsed but not carried out, and commands of installation are looked up; docs/frameworks has a test of
-its own, since its libraries do not fit together.
+Long commands are parsed but not carried out, and commands of installation are looked up.
+
+The pages of docs/frameworks need packages that can't stand beside each other. Each runs in an interpreter of its own
+where its packages are, and is skipped elsewhere; `pytest tests/test_pages.py -k PAGE -s` shows what it measures.
 """
 
+import ast
+import importlib.util
+import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -67,7 +74,9 @@ def carry_out(line: str) -> None:
             assert shutil.which(tool), f"{tool} of {line!r} is no command that this project brings"
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if any(re.match(r"\w", language) for language, _ in blocks(page))])
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if {"python", "sh", "bash"} & {each[0] for each in blocks(page)}]
+)
 def test_the_code_blocks_run_one_after_another(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -92,3 +101,29 @@ def test_the_code_blocks_run_one_after_another(
         assert {"depot.html", "depot.svg", "again.html", "expert.svg"} <= {each.name for each in tmp_path.iterdir()}
     if page == "docs/tutorials/train_and_evaluate.md":
         assert (tmp_path / "runs" / "look" / "evaluation" / "failures.html").is_file()
+
+
+@pytest.mark.parametrize("page", sorted(page.stem for page in (ROOT / "docs" / "frameworks").glob("*.md")))
+def test_a_frameworks_page_runs_where_its_packages_are(page: str, tmp_path: Path) -> None:
+    code = "\n".join(text for language, text in blocks(f"docs/frameworks/{page}.md") if language == "python")
+    missing = sorted(name for name in imported(code) if importlib.util.find_spec(name) is None)
+    if missing:
+        pytest.skip(f"not installed: {', '.join(missing)}")
+    (tmp_path / "page.py").write_text(code, encoding="utf-8")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "page.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    print(done.stdout)
+
+
+def imported(code: str) -> set[str]:
+    """The packages that a program imports."""
+    names = set()
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(str(node.module).split(".")[0])
+    return names

@@ -134,8 +134,9 @@ def judged(instances, solutions):
 
 def test_the_worst_cases_come_first_beside_the_experts_solutions():
     plain = parse_instance("A.a\n...\nB.b")
-    straight = Solution(np.array([plain.starts, plain.starts + (0, 1), plain.goals]))
-    slow = Solution(np.array([plain.starts, *4 * [plain.starts + (0, 1)], plain.goals]))
+    between = plain.starts + np.array([0, 1])
+    straight = Solution(np.array([plain.starts, between, plain.goals]))
+    slow = Solution(np.array([plain.starts, *4 * [between], plain.goals]))
     one_fails = walked(plain, "RR" + 46 * "I", "I")
     both_fail = walked(plain, "I", "I")
     played = judged([plain] * 4, [straight, one_fails, slow, both_fail])

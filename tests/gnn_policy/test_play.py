@@ -76,9 +76,7 @@ def test_every_option_reaches_the_rollout(home, monkeypatch):
     )
     rows = [Execution(sample="stuck"), Execution(), Execution(sample=True, temperature=0.5, shield="pibt")]
     limits = [4 * longest, 4 * longest, 7]
-    assert asked == [
-        {"seed": 3, "max_steps": limit, **asdict(row)} for row, limit in zip(rows, limits, strict=True)
-    ]
+    assert asked == [{"seed": 3, "max_steps": limit, **asdict(row)} for row, limit in zip(rows, limits, strict=True)]
 
 
 def test_a_scenario_elsewhere_takes_the_first_robots_and_a_map(home):

@@ -9,6 +9,7 @@
 #include <set>
 #include <vector>
 
+#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/generate.hpp"
 #include "mapf_env/native/team_step.hpp"
 
@@ -28,7 +29,9 @@ void play(std::uint64_t seed) {
     const int height = 1 + random.below(12), width = 2 + random.below(12), radius = 1 + random.below(6);
     const auto style = static_cast<Style>(random.below(6));
     const int obstacles = style == Style::cells ? random.below(height * width / 3 + 1) : 0;
-    const Grid grid = random_map(style, height, width, obstacles, random);
+    const Parts parts{1 + random.below(4), random.below(3) / 2.0, 1 + random.below(7), 1 + random.below(5),
+                      1 + random.below(3)};
+    const Grid grid = random_map(style, parts, height, width, obstacles, random);
     int free = 0;
     for (const auto cell : grid.blocked) free += cell == 0;
     if (free < 2) return;
