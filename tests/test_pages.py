@@ -64,6 +64,8 @@ def carry_out(line: str) -> None:
         case ["python", "-m", "gnn_policy.train", *options]:
             if train.parse(options).config.epochs <= 2:
                 train.main([*options, "--threads", "1"])
+        case ["python", "benchmarks/report.py", *options]:
+            subprocess.run([sys.executable, str(ROOT / "benchmarks" / "report.py"), *options], check=True, timeout=120)
         case ["python", script, *_] if (ROOT / script).is_file():
             return
         case ["sphinx-build", "--fail-on-warning", source, _]:  # of the extra "docs"
