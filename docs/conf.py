@@ -32,8 +32,8 @@ html_show_copyright = False
 def setup(app):
     """Keep napoleon from reading the words before an attribute's first colon as its type."""
 
-    def dash(app, what, name, subject, options, lines):
+    def comma(app, what, name, subject, options, lines):
         if what in ("attribute", "property", "data") and lines:
-            lines[0] = lines[0].replace(": ", " \u2013 ", 1)
+            lines[0] = lines[0].replace(": ", ", ", 1)
 
-    app.connect("autodoc-process-docstring", dash, priority=400)
+    app.connect("autodoc-process-docstring", comma, priority=400)

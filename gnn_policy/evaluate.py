@@ -58,8 +58,10 @@ class Command:
     """T_max in makespans of the expert's solution."""
     seed: int | None = None
     """Of sampling and of the shield's tie-breaking."""
+    failures: int = 0
+    """How many of the worst cases of the first row to replay beside the expert's solutions, in failures.html."""
     out: Path | None = None
-    """Folder for results.json and animation.svg; if not given, evaluation/ in the run folder or beside the file, and
+    """Folder for results.json and pictures; if not given, evaluation/ in the run folder or beside the file, and
     in the working folder for the policy that comes with the package."""
     threads: int = 0
     """CPU threads; 0 takes all that the process may use."""
@@ -94,6 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             variants=variants,
             split=command.split,
             threads=threads,
+            failures=command.failures,
         )
 
 

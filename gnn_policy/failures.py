@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -64,6 +65,12 @@ def _cut_off(
     blocked = instance.grid.copy()
     blocked[tuple(instance.goals[resting].T)] = True
     return bool(_native.distances(blocked, goal[None])[0, cell[0], cell[1]] < 0)
+
+
+def count_failures(played: Rollouts) -> dict[Failure, int]:
+    """How many of the played cases failed in each of the ways."""
+    found = Counter(failure(*case) for case in zip(played.instances, played.solutions, strict=True))
+    return {kind: found[kind] for kind in get_args(Failure) if found[kind]}
 
 
 def worst(played: Rollouts, expert: Sequence[Solution], count: int) -> list[Scene]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +15,7 @@ from rich.console import Console
 
 from gnn_policy import checkpoint
 from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
+from gnn_policy.execution import Execution
 from gnn_policy.failures import failure
 from gnn_policy.rollout import rollout
 from mapf_env import EnvConfig, Instance, _native, load_map, load_scen, random_instance, replay
@@ -35,8 +36,8 @@ class Command:
     """A run folder of training, or a .safetensors file; the policy that comes with the package if not given."""
     map: Path | None = None
     """The map of a scenario, if it does not lie beside it."""
-    sample: bool = True
-    """Draw moves from the policy's softmax; the most probable moves if not."""
+    row: str = "stuck"
+    """How to execute the policy, in the words of the rows of `python -m gnn_policy.evaluate`."""
     max_steps: int | None = None
     """T_max; four times the longest way that a robot has to go if not given."""
     seed: int = 0
@@ -54,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.play"
         )
         torch.set_num_threads(cpu_threads(command.threads))
-        policy = checkpoint.load(command.run)
+        policy, execution = checkpoint.load(command.run), Execution.parse(command.row)
         instance = _problem(command)
         steps = _patience(instance) if command.max_steps is None else command.max_steps
         out = command.out or Path(f"{command.file.stem}.html")
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         size = f"{instance.num_agents} robots on {instance.grid.shape[0]} x {instance.grid.shape[1]} cells"
         before = time.perf_counter()
         with console.status(f"{size}, {steps} steps at most"):
-            played = rollout(policy, [instance], sample=command.sample, seed=command.seed, max_steps=steps)
+            played = rollout(policy, [instance], seed=command.seed, max_steps=steps, **asdict(execution))
         seconds = time.perf_counter() - before
         (solution,) = played.solutions
         home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())

@@ -14,10 +14,11 @@ from gnn_policy import checkpoint, evaluation
 from gnn_policy.cases import Split
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
+from gnn_policy.failures import count_failures, worst
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.rollout import Rollouts
 from gnn_policy.training import split_cases
-from mapf_env import animate
+from mapf_env import EnvConfig, Scene, animate, replay_scenes
 from mapf_env.files import write_whole
 
 VARIANTS = (Execution(), Execution(sample="stuck"), Execution(sample=True))
@@ -34,6 +35,7 @@ def examine(
     variants: Sequence[Execution] = VARIANTS,
     split: Split = "test",
     threads: int,
+    failures: int = 0,
 ) -> None:
     """Print one table for each team size; write animation.svg and, at the very end, results.json into `folder`.
 
@@ -46,19 +48,24 @@ def examine(
         variants: How to execute the policy, one row for each.
         split: Which maps.
         threads: CPU threads of the expert.
+        failures: How many of the worst cases of the first variant to show beside the expert's solutions, for each team
+            size, in failures.html.
 
     Raises:
-        ValueError: If there is no variant.
+        ValueError: If there is no variant, or `failures` is negative.
         FileExistsError: If the folder has results of other settings.
     """
     if not variants:
         raise ValueError("there is no way to execute the policy: give at least one row")
+    if failures < 0:
+        raise ValueError(f"failures must not be negative, got {failures}")
     sizes = tuple(num_agents) or (config.num_agents,)
     settings = _settings(policy, config, sizes, variants, split)
     _refuse_to_overwrite(folder / "results.json", settings)
     cases = {N: split_cases(config, split, N) for N in sizes}
     tables: dict[str, object] = {}
     shown: list[Rollouts] = []
+    scenes: list[Scene] = []
     with console.status("") as status:
         for N, instances in cases.items():
             title = f"{N} robots, {settings['maps']} {split} maps"
@@ -72,13 +79,20 @@ def examine(
                 progress=lambda phase, title=title: status.update(f"{title}: {phase}"),
             )
             console.print(evaluation.table(title, rows, exam))
-            tables[str(N)] = evaluation.as_json(rows, exam)
+            kinds = {each.name: count_failures(played) for each, played in zip(variants, shown, strict=True)}
+            tables[str(N)] = {**evaluation.as_json(rows, exam), "failures": kinds}
+            scenes += worst(shown[0], exam.solutions, failures)
     best = max(shown, key=lambda played: played.success.mean())
     case = _worth_watching(best)
     outcome = "all on goal" if best.success[case] else "timed out"
     title = f"Trained policy, {best.instances[case].num_agents} robots, unseen map: {outcome}"
     animate(best.instances[case], best.solutions[case], folder / "animation.svg", title=title)
     console.print(f"animation: {folder / 'animation.svg'}", highlight=False)
+    if scenes:
+        title = f"The worst cases of {variants[0].name} beside the expert's solutions"
+        radii = EnvConfig(fov_radius=policy.config.fov_radius, comm_radius=policy.config.comm_radius)
+        replay_scenes(scenes, folder / "failures.html", title=title, config=radii)
+        console.print(f"worst cases: {folder / 'failures.html'}", highlight=False)
     write_whole(folder / "results.json", json.dumps({"settings": settings, "num_agents": tables}, indent=2) + "\n")
     console.print(f"numbers: {folder / 'results.json'}", highlight=False)
 

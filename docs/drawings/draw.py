@@ -16,9 +16,9 @@ TEAM = """
     ..........
     .A.#..B...
     ...#......
-    .C.##..D..
+    ..C##..D..
     ........d.
-    ..c.......
+    .........c
     a......b..
 """
 
@@ -28,8 +28,8 @@ def drawings() -> dict[str, str]:
     instance = parse_instance(TEAM)
     return {
         "instance": draw(instance),
-        "view": view(instance, robot=0, radius=2),
-        "channels": channels(instance, robot=0, radius=2),
+        "view": view(instance, robot=2, radius=2),
+        "channels": channels(instance, robot=2, radius=2),
         "graph": graph(instance, radius=5.0),
         "vertex_conflict": animate(*walked("A.B\n...", "R", "L", steps=1), title="Vertex conflict"),
         "swap_conflict": animate(*walked("bAB.a", "R", "L", steps=1), title="Swap conflict"),

@@ -25,7 +25,7 @@ CONFIG = TrainConfig(
 
 CHANGES = """
     --num-agents 2 5 --maps 2 --cases-per-map 3 --height 7 --width 8 --density 0.2 --styles walls --data-seed 9 --w 1.5
-    --timeout 4 --seed 6 --threads 1 --rows stuck,0.5 argmax,pibt,connected
+    --timeout 4 --seed 6 --threads 1 --rows stuck,0.5 argmax,pibt,connected --failures 2
 """
 
 
@@ -81,14 +81,17 @@ def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path, split
         "variants": [Execution(sample="stuck", temperature=0.5), Execution(shield="pibt", comm_range="connected")],
         "split": split,
         "threads": 1,
+        "failures": 2,
     }
     assert torch.get_num_threads() == 1
     assert folder == tmp_path / "out"
 
 
 def test_it_writes_numbers_and_an_animation(file, capsys):
-    evaluate.main([str(file), "--num-agents", "2", "3", "--threads", "1"])
+    evaluate.main([str(file), "--num-agents", "2", "3", "--threads", "1", "--failures", "2"])
     folder = file.parent / "evaluation"
+    page = (folder / "failures.html").read_text(encoding="utf-8")
+    assert [page.count(f'"title":"{n} robots, case ') for n in (2, 3)] == [2, 2]
     tables = json.loads((folder / "results.json").read_text())["num_agents"]
     assert list(tables) == ["2", "3"]
     assert all(table["cases"] == 6 for table in tables.values())
@@ -157,6 +160,7 @@ def test_results_of_another_policy_or_another_program_are_not_overwritten(file, 
         "--num-agents 0",
         "--seed -1",
         "--threads -1",
+        "--failures -1",
     ],
 )
 def test_a_mistake_takes_one_line(file, capsys, wrong):

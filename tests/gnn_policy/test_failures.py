@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 import oracles
 import strategies
-from gnn_policy.failures import LAST_STEPS, failure
+from gnn_policy import Rollouts
+from gnn_policy.failures import LAST_STEPS, count_failures, failure, worst
 from mapf_env import Instance, Solution, parse_instance
 
 
@@ -114,3 +115,39 @@ def test_it_is_the_definition_whatever_the_order_of_robots_and_the_side_of_the_m
     order = random.sample(range(instance.num_agents), instance.num_agents)
     turned = Instance(instance.grid.T, instance.starts[order][:, ::-1], instance.goals[order][:, ::-1])
     assert failure(turned, Solution(np.array(paths)[:, order, ::-1])) == kind
+
+
+def judged(instances, solutions):
+    """Rollouts as `rollout` would judge these paths, with T_max 40."""
+    on_goal = [(each.paths[-1] == case.goals).all(axis=1) for case, each in zip(instances, solutions, strict=True)]
+    times = [np.where(there, each.arrivals, 40) for there, each in zip(on_goal, solutions, strict=True)]
+    return Rollouts(
+        instances,
+        solutions,
+        np.array([there.all() for there in on_goal]),
+        np.array([each.sum() for each in times]),
+        np.array([each.max() for each in times]),
+        np.array([there.all() for there in on_goal]),
+        np.zeros(len(instances)),
+    )
+
+
+def test_the_worst_cases_come_first_beside_the_experts_solutions():
+    plain = parse_instance("A.a\n...\nB.b")
+    between = plain.starts + np.array([0, 1])
+    straight = Solution(np.array([plain.starts, between, plain.goals]))
+    slow = Solution(np.array([plain.starts, *4 * [between], plain.goals]))
+    one_fails = walked(plain, "RR" + 46 * "I", "I")
+    both_fail = walked(plain, "I", "I")
+    played = judged([plain] * 4, [straight, one_fails, slow, both_fail])
+    scenes = worst(played, [straight] * 4, 3)
+    assert [scene.title for scene in scenes] == [
+        "2 robots, case 3: deadlock, 2 not on goal, flowtime +1900%",
+        "2 robots, case 1: deadlock, 1 not on goal, flowtime +950%",
+        "2 robots, case 2: solved, flowtime +150%",
+    ]
+    assert [dict(scene.solutions) for scene in scenes] == [
+        {"policy": each, "expert": straight} for each in (both_fail, one_fails, slow)
+    ]
+    assert worst(played, [straight] * 4, 0) == []
+    assert count_failures(played) == {"deadlock": 2}

@@ -2,13 +2,13 @@
 
 import json
 import re
-from dataclasses import fields
+from dataclasses import asdict, fields
 
 import pytest
 import torch
 
 import oracles
-from gnn_policy import DecentralizedPolicy, PolicyConfig, play, rollout, save
+from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, play, rollout, save
 from mapf_env import load_scen, random_instance, save_map, save_scen
 
 
@@ -67,18 +67,16 @@ def test_robots_are_placed_on_a_map_by_the_seed(home):
 def test_every_option_reaches_the_rollout(home, monkeypatch):
     asked = []
     monkeypatch.setattr(play, "rollout", lambda *given, **how: asked.append(how) or rollout(*given, **how))
-    for options in ([], ["--no-sample"], ["--max-steps", "7"]):
+    for options in ([], ["--row", "argmax"], ["--row", "sampled,0.5,pibt", "--max-steps", "7"]):
         played("own.scen", "--seed", "3", *options)
     instance = load_scen("own.scen")
     longest = max(
         oracles.distances(instance.grid, goal)[start]
         for start, goal in zip(oracles.cells(instance.starts), oracles.cells(instance.goals), strict=True)
     )
-    assert asked == [
-        {"sample": True, "seed": 3, "max_steps": 4 * longest},
-        {"sample": False, "seed": 3, "max_steps": 4 * longest},
-        {"sample": True, "seed": 3, "max_steps": 7},
-    ]
+    rows = [Execution(sample="stuck"), Execution(), Execution(sample=True, temperature=0.5, shield="pibt")]
+    limits = [4 * longest, 4 * longest, 7]
+    assert asked == [{"seed": 3, "max_steps": limit, **asdict(row)} for row, limit in zip(rows, limits, strict=True)]
 
 
 def test_a_scenario_elsewhere_takes_the_first_robots_and_a_map(home):
@@ -104,6 +102,7 @@ def test_a_team_that_is_home_has_solved_it(home, capsys):
         ("own.map --agents 3 --seed -1", "seed"),
         ("own.map --agents 3 --max-steps 0", "max_steps must be at least 1"),
         ("own.map --agents 3 --threads -1", "threads"),
+        ("own.map --agents 3 --row best", "unknown word 'best'"),
         ("own.map --agents 3 --out none/page.html", "none is no folder"),
         ("own.map --agents 3 --out elsewhere", "elsewhere is a folder"),
         ("none.map --agents 3", "none.map"),
