@@ -14,6 +14,8 @@ from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
 Recipe = Literal["quick", "full", "paper"]
+Ties = Literal["fixed", "varied"]
+Aggregation = Literal["visited", "stuck"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,10 +49,14 @@ class TrainConfig:
     timeout: float = 3.0
     """T_max in makespans of the expert's solution."""
 
+    teacher: str = "ecbs"
+    """Who shows the moves: "ecbs", "lacam", "prioritised", "pibt", or a solver of your own as "module:function"."""
     w: float = 1.05
-    """The expert's cost is at most w times the lower bound of the optimum."""
+    """ECBS's cost is at most w times the lower bound of the optimum; its plans also set T_max."""
+    ties: Ties = "fixed"
+    """Among equally good moves the teacher decides by one seed in all states, or by a seed of each state's own."""
     expert_nodes: int = 2000
-    """High-level nodes that the expert may expand to label a state; unlabelled states are counted and left out."""
+    """Nodes that ECBS or LaCAM may generate to label a state; unlabelled states are counted and left out."""
 
     epochs: int = 150
     """Rounds of collecting and fitting; round 0 imitates the expert, the others aggregate what the policy visits."""
@@ -60,6 +66,9 @@ class TrainConfig:
     """Team states in a gradient step."""
     demonstration_steps: int = 524_288
     """Team steps played in round 0, by the expert."""
+    aggregation: Aggregation = "visited"
+    """What is aggregated: every "visited" state, or plans from where teams are "stuck" at the end of their time, as the
+    released code does."""
     dagger_every: int = 4
     """Rounds from one aggregation to the next; 0 for plain imitation."""
     dagger_steps: int = 32_768

@@ -138,17 +138,22 @@ def compare(
         progress(variant.name)
         played.append(rollout(policy, exam.instances, seed=seed, max_steps=exam.max_steps, **asdict(variant)))
         rows.append(score(variant.name + mark, exam, played[-1]))
-    cases = exam.instances
-    baselines = {
+    return [*rows, *baselines(exam, seed=seed, progress=progress)], played
+
+
+def baselines(exam: Exam, *, seed: int = 0, progress: Callable[[str], None] = lambda phase: None) -> list[Score]:
+    """The rows of those that learn nothing: random, greedy, greedy with random moves if stuck, PIBT, the expert."""
+    cases, rows = exam.instances, []
+    actors = {
         "random": RandomActor(),
         "greedy*": GreedyActor(cases),
         "greedy,stuck*": GreedyActor(cases, random_when_stuck=True),
     }
-    for name, actor in baselines.items():
+    for name, actor in actors.items():
         progress(name)
         rows.append(score(name, exam, rollout(actor, cases, seed=seed, max_steps=exam.max_steps)))
     progress("PIBT")
-    return [*rows, _pibt_score(exam, seed), _expert_score(exam)], played
+    return [*rows, _pibt_score(exam, seed), _expert_score(exam)]
 
 
 def _pibt_score(exam: Exam, seed: int) -> Score:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import csv
 import pickle
 import time
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from gnn_policy import checkpoint, evaluation
 from gnn_policy.cases import Split, make_cases
 from gnn_policy.command_line import cpu_threads
 from gnn_policy.config import TrainConfig
-from gnn_policy.dagger import Aggregator
+from gnn_policy.dagger import Aggregator, Teacher
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.imitation import ImitationLoss
 from gnn_policy.learning_curve import Round, draw_learning_curve
@@ -88,12 +89,24 @@ def open_run(folder: Path, config: TrainConfig) -> None:
 class Training:
     """A training run in its folder; `run` goes on from the last finished round.
 
+    Args:
+        config: Its settings.
+        folder: Its folder.
+        progress: Told what goes on.
+        clock: What seconds are measured by; `time.process_time` where the machine is shared.
+
     Raises:
         ValueError: If settings do not fit together, or a file of the run is damaged.
         FileExistsError: If the folder holds something else than an unfinished run with these settings.
     """
 
-    def __init__(self, config: TrainConfig, folder: Path, progress: TrainingProgress) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        folder: Path,
+        progress: TrainingProgress,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.config, self.folder, self.progress = config, folder, progress
         self.threads = cpu_threads(config.threads)
         torch.set_num_threads(self.threads)
@@ -110,9 +123,18 @@ class Training:
         self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.epochs, config.final_lr)
         self.history: list[Round] = []
         self._seconds_before = 0.0
-        self._began = time.monotonic()
+        self._clock, self._began = clock, clock()
         self._instances = split_cases(config, "train")
         self._validation = split_cases(config, "validation")
+        self._teacher = Teacher(
+            self._instances,
+            solver=config.teacher,
+            w=config.w,
+            ties=config.ties,
+            node_limit=config.expert_nodes,
+            threads=self.threads,
+            clock=clock,
+        )
         open_run(folder, config)
         (folder / "demonstrations").mkdir(exist_ok=True)
         if (folder / "state.pt").exists():
@@ -124,7 +146,7 @@ class Training:
         config = self.config
         exam = evaluation.Exam.prepare(self._validation, w=config.w, timeout=config.timeout, threads=self.threads)
         batches = BatchMaker(self._instances, config.policy, augment=config.augment)
-        aggregator = Aggregator(config, self.policy, self._instances, self.threads)
+        aggregator = Aggregator(config, self.policy, self._teacher, self._instances)
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history))
         try:
             for number in range(len(self.history), config.epochs):
@@ -142,7 +164,7 @@ class Training:
 
     def _round(self, number: int, aggregator: Aggregator, batches: BatchMaker, exam: evaluation.Exam) -> Round:
         config = self.config
-        began, unlabelled = time.monotonic(), 0
+        began, taught, unlabelled = self._clock(), self._teacher.seconds, 0
         if self._collects(number):
             self.progress.phase(number, "collecting")
             steps = config.dagger_steps if number else config.demonstration_steps
@@ -153,11 +175,11 @@ class Training:
         self._shards = [demonstrations]
         if len(demonstrations) == 0:
             raise ValueError("the expert solved none of the visited states: raise expert_nodes or make cases easier")
-        between = time.monotonic()
+        between = self._clock()
         lr = float(self.scheduler.get_last_lr()[0])
         loss, accuracy, updates = self._fit(number, demonstrations, batches)
         self.scheduler.step()
-        done = time.monotonic()
+        done = self._clock()
         previous = self.history[-1] if self.history else None
         row = Round(
             round=number,
@@ -165,6 +187,7 @@ class Training:
             samples=updates * config.batch_size * config.num_agents + (previous.samples if previous else 0),
             seconds=0.0,
             collect_seconds=between - began,
+            expert_seconds=self._teacher.seconds - taught,
             fit_seconds=done - between,
             loss=loss,
             accuracy=accuracy,
@@ -175,7 +198,7 @@ class Training:
         if (number + 1) % config.validate_every == 0 or number + 1 == config.epochs:
             self.progress.phase(number, "validation")
             self._validate(row, exam)
-        row.seconds = self._seconds_before + time.monotonic() - self._began
+        row.seconds = self._seconds_before + self._clock() - self._began
         return row
 
     def _collects(self, number: int) -> bool:

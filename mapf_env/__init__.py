@@ -15,7 +15,7 @@ from mapf_env.instance_set import instance_hash, load_instances, save_instances
 from mapf_env.joint_v0 import JointEnv, joint_env
 from mapf_env.movingai import load_map, load_scen, save_map, save_scen
 from mapf_env.render import animate, draw
-from mapf_env.replay import replay
+from mapf_env.replay import Scene, replay, replay_scenes
 from mapf_env.rewards import SCHEMES, Rewards
 from mapf_env.rules import Edges, communication_edges, communication_graph
 from mapf_env.solution import MOVES, Action, Conflict, Solution
@@ -35,6 +35,7 @@ __all__ = [
     "Observation",
     "Rewards",
     "Rooms",
+    "Scene",
     "Solution",
     "Step",
     "Warehouse",
@@ -56,6 +57,7 @@ __all__ = [
     "random_map",
     "random_maps",
     "replay",
+    "replay_scenes",
     "save_instances",
     "save_map",
     "save_scen",

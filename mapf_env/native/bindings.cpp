@@ -9,6 +9,7 @@
 #include <tuple>
 
 #include "mapf_env/native/arrays.hpp"
+#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/generate.hpp"
 #include "mapf_env/native/goals.hpp"
 #include "mapf_env/native/grid.hpp"

@@ -6,6 +6,7 @@
 #include <cstring>
 #include <vector>
 
+#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/grid.hpp"
 
 namespace mapf {

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/goals.hpp"
 #include "mapf_env/native/graph.hpp"
 #include "mapf_env/native/grid.hpp"

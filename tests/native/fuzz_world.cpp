@@ -9,6 +9,7 @@
 #include <set>
 #include <vector>
 
+#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/generate.hpp"
 #include "mapf_env/native/team_step.hpp"
 
