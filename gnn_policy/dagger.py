@@ -12,6 +12,7 @@ import pkgutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -145,8 +146,8 @@ class Teacher:
 
     def _varied(self, instance: Instance) -> experts.Result:
         seed = np.zeros(1, np.uint64)
-        for coordinate in instance.starts.ravel().astype(np.uint64):
-            seed = _native.mix(seed, coordinate[None])
+        for coordinate in instance.starts.ravel().tolist():
+            seed = _native.mix(seed, np.array([coordinate], np.uint64))
         solve = solver_named(self._name, w=self._w, time_limit=math.inf, node_limit=self._node_limit, seed=int(seed[0]))
         return solve(instance)
 
@@ -167,7 +168,7 @@ def _own_solver(name: str) -> experts.Solver:
         raise ValueError(f"{wanted}; {name!r} cannot be found: {missing}") from None
     if not callable(solver):
         raise ValueError(f"{wanted}; {name!r} is no function but {type(solver).__name__}")
-    return solver
+    return cast(experts.Solver, solver)
 
 
 class Mixture(TensorDictModuleBase):
