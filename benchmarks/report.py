@@ -214,7 +214,7 @@ def side_by_side(*diagrams: Axes) -> str:
     pictures = []
     for diagram in diagrams:
         file = io.StringIO()
-        diagram.get_figure(root=True).savefig(file, format="svg", metadata={"Date": None})
+        cast(Figure, diagram.figure).savefig(file, format="svg", metadata={"Date": None})
         pictures.append(file.getvalue()[file.getvalue().index("<svg") :])
     return f"<section>{''.join(pictures)}</section>"
 
