@@ -8,11 +8,14 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from gnn_policy.cases import Split
 from gnn_policy.network import PolicyConfig
 from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
 Recipe = Literal["quick", "full", "paper"]
+Ties = Literal["fixed", "varied"]
+Aggregation = Literal["visited", "stuck"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,10 +49,14 @@ class TrainConfig:
     timeout: float = 3.0
     """T_max in makespans of the expert's solution."""
 
+    teacher: str = "ecbs"
+    """Who shows the moves: "ecbs", "lacam", "prioritised", "pibt", or a solver of your own as "module:function"."""
     w: float = 1.05
-    """The expert's cost is at most w times the lower bound of the optimum."""
+    """ECBS's cost is at most w times the lower bound of the optimum; its plans also set T_max."""
+    ties: Ties = "fixed"
+    """Among equally good moves the teacher decides by one seed in all states, or by a seed of each state's own."""
     expert_nodes: int = 2000
-    """High-level nodes that the expert may expand to label a state; unlabelled states are counted and left out."""
+    """Nodes that ECBS or LaCAM may generate to label a state; unlabelled states are counted and left out."""
 
     epochs: int = 150
     """Rounds of collecting and fitting; round 0 imitates the expert, the others aggregate what the policy visits."""
@@ -59,6 +66,9 @@ class TrainConfig:
     """Team states in a gradient step."""
     demonstration_steps: int = 524_288
     """Team steps played in round 0, by the expert."""
+    aggregation: Aggregation = "visited"
+    """What is aggregated: every "visited" state, or plans from where teams are "stuck" at the end of their time, as the
+    released code does."""
     dagger_every: int = 4
     """Rounds from one aggregation to the next; 0 for plain imitation."""
     dagger_steps: int = 32_768
@@ -120,6 +130,14 @@ class TrainConfig:
             raise ValueError(f"w must be at least 1 and finite, got {self.w}")
         if self.updates_per_epoch is not None and self.updates_per_epoch < 1:
             raise ValueError(f"updates_per_epoch must be at least 1, got {self.updates_per_epoch}")
+
+    def size_of(self, split: Split) -> tuple[int, int]:
+        """The number of maps of a split, and of cases on each."""
+        return {
+            "train": (self.train_maps, self.cases_per_map),
+            "validation": (self.validation_maps, self.validation_cases_per_map),
+            "test": (self.test_maps, self.cases_per_map),
+        }[split]
 
     def save(self, path: Path) -> None:
         """Write the settings as JSON."""

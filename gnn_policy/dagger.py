@@ -1,12 +1,17 @@
-"""Dataset aggregation: play a mixture of expert and policy, and ask the expert about every state that is visited.
+"""Dataset aggregation: play a mixture of expert and policy, and ask the expert about the states that are visited.
 
 Source: Ross, Gordon and Bagnell 2011 (DAgger). What matters there holds here: the states come from the mixture, the
-labels from the expert alone, and the data of all rounds are kept.
+labels from the expert alone, and the data of all rounds are kept. The variant that asks only where teams are stuck is
+that of the paper's released code.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+import pkgutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import numpy.typing as npt
@@ -16,37 +21,111 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 import experts
-from gnn_policy.config import TrainConfig
+from experts.many import SOLVER_NAMES, solver_named
+from gnn_policy.config import Ties, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.ranks import Ranks
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
-from mapf_env import Instance
+from mapf_env import Action, Instance, Solution, _native
 
 
 class Teacher:
-    """The expert, as training asks it: for the joint move in each of many states of known cases.
+    """The expert, as training asks it: for the joint move in each of many states of known cases, or for its plan there.
 
     Args:
         instances: The training cases.
-        w: The expert's bound on suboptimality.
-        node_limit: Its effort for a state.
+        solver: The expert: one of the solvers that `experts.solve_many` knows by name, or "module:function".
+        w: ECBS's bound on suboptimality.
+        ties: Whether a named solver decides ties by one seed in all states, or by a seed that each state makes.
+        node_limit: ECBS's and LaCAM's effort for a state.
         threads: CPU threads.
+        clock: What `seconds` are measured by.
+
+    Raises:
+        ValueError: If there is no such solver, or it cannot be told how to break ties.
     """
 
-    def __init__(self, instances: Sequence[Instance], *, w: float, node_limit: int, threads: int) -> None:
-        self._instances, self._w, self._node_limit, self._threads = instances, w, node_limit, threads
+    def __init__(
+        self,
+        instances: Sequence[Instance],
+        *,
+        solver: str = "ecbs",
+        w: float,
+        ties: Ties = "fixed",
+        node_limit: int,
+        threads: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._instances, self._name, self._w, self._ties = instances, solver, w, ties
+        self._node_limit, self._threads, self._clock = node_limit, threads, clock
+        self._solver: str | experts.Solver = solver
+        if solver not in SOLVER_NAMES:
+            self._solver = _own_solver(solver)
+            if ties != "fixed":
+                raise ValueError(f"ties must be 'fixed' with the solver {solver!r}, which breaks them as it likes")
+        elif ties == "varied":
+            self._solver = self._varied
+        self.seconds = 0.0
+        """Time that it has taken to answer, so far."""
 
     def moves(
         self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]
     ) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
         """Joint moves (M, N) in M states (M, N, 2) of the given cases (M,), and which of them the expert solved."""
-        return experts.relabel(
-            [self._instances[i] for i in cases],
-            positions,
-            w=self._w,
-            node_limit=self._node_limit,
-            threads=self._threads,
-        )
+        if self._solver != "ecbs":
+            plans = self.plans(cases, positions)
+            moves = np.full(positions.shape[:2], Action.IDLE, np.int8)
+            for state, plan in enumerate(plans):
+                if plan is not None and len(plan.paths) > 1:
+                    moves[state] = Solution(plan.paths[:2]).actions[0]
+            return moves, np.array([plan is not None for plan in plans], np.bool_)
+        with self._timed():
+            return experts.relabel(
+                [self._instances[i] for i in cases],
+                positions,
+                w=self._w,
+                node_limit=self._node_limit,
+                threads=self._threads,
+            )
+
+    def plans(self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]) -> list[Solution | None]:
+        """The plan from each of M states, or None where the expert found none."""
+        with self._timed():
+            results = experts.solve_many(
+                [self._instances[case].at(state) for case, state in zip(cases, positions, strict=True)],
+                solver=self._solver,
+                w=self._w,
+                threads=self._threads,
+                time_limit=math.inf,
+                node_limit=self._node_limit,
+            )
+        plans = [result.solution for result in results]
+        for state, plan in zip(positions, plans, strict=True):
+            if plan is not None and not np.array_equal(plan.paths[0], state):
+                raise ValueError(
+                    f"the solver {self._name!r} answered with a plan from {plan.paths[0].tolist()} where it was asked "
+                    f"from {state.tolist()}"
+                )
+        return plans
+
+    def demonstrate(
+        self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]
+    ) -> tuple[Demonstrations, int]:
+        """Demonstrations of all states on the plans from the given ones, and how many the expert could not solve."""
+        N, unsolved = positions.shape[1], 0
+        parts = [Demonstrations(np.empty(0, np.int32), np.empty((0, N, 2), np.int16), np.empty((0, N), np.int8))]
+        for case, plan in zip(cases, self.plans(cases, positions), strict=True):
+            if plan is None:
+                unsolved += 1
+                continue
+            steps = plan.makespan
+            parts.append(
+                Demonstrations(
+                    np.full(steps, case, np.int32), plan.paths[:steps].astype(np.int16), plan.actions[:steps]
+                )
+            )
+        return Demonstrations.concatenate(parts), unsolved
 
     def label(self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]) -> tuple[Demonstrations, int]:
         """Demonstrations of the given states, in their order, and how many the expert could not solve.
@@ -63,6 +142,32 @@ class Teacher:
             cases[solved].astype(np.int32), positions[solved].astype(np.int16), actions[solved].astype(np.int8)
         )
         return labelled, int((~solved).sum())
+
+    def _varied(self, instance: Instance) -> experts.Result:
+        seed = np.zeros(1, np.uint64)
+        for coordinate in instance.starts.ravel().astype(np.uint64):
+            seed = _native.mix(seed, coordinate[None])
+        solve = solver_named(self._name, w=self._w, time_limit=math.inf, node_limit=self._node_limit, seed=int(seed[0]))
+        return solve(instance)
+
+    @contextmanager
+    def _timed(self) -> Iterator[None]:
+        began = self._clock()
+        yield
+        self.seconds += self._clock() - began
+
+
+def _own_solver(name: str) -> experts.Solver:
+    wanted = f"the teacher must be one of {', '.join(SOLVER_NAMES)}, or a solver of your own as 'module:function'"
+    if ":" not in name:
+        raise ValueError(f"{wanted}; got {name!r}")
+    try:
+        solver = pkgutil.resolve_name(name)
+    except (ImportError, AttributeError, ValueError) as missing:
+        raise ValueError(f"{wanted}; {name!r} cannot be found: {missing}") from None
+    if not callable(solver):
+        raise ValueError(f"{wanted}; {name!r} is no function but {type(solver).__name__}")
+    return solver
 
 
 class Mixture(TensorDictModuleBase):
@@ -100,22 +205,32 @@ class Mixture(TensorDictModuleBase):
 class Aggregator:
     """Collects demonstrations round by round through a TorchRL collector."""
 
-    def __init__(self, config: TrainConfig, policy: DecentralizedPolicy, instances: Sequence[Instance], threads: int):
-        self._config = config
-        self._teacher = Teacher(instances, w=config.w, node_limit=config.expert_nodes, threads=threads)
-        self._mixture = Mixture(policy, self._teacher, sample=config.sample_rollouts)
+    def __init__(
+        self,
+        config: TrainConfig,
+        policy: DecentralizedPolicy,
+        teacher: Teacher,
+        instances: Sequence[Instance],
+        ranks: Ranks = Ranks(),
+    ) -> None:
+        self._config, self._teacher, self._rank = config, teacher, ranks.rank
+        self._teams = ranks.share("rollout_teams", config.rollout_teams)
+        self._mixture = Mixture(policy, teacher, sample=config.sample_rollouts)
         self._env = TeamEnv(
-            config.rollout_teams,
+            self._teams,
             instances,
             fov_radius=config.policy.fov_radius,
+            extra_channels=("cost_to_go",) if config.policy.cost_to_go else (),
             comm_radius=config.policy.comm_radius,
+            comm_range=config.policy.comm_range,
+            comm_weights=config.policy.comm_weights,
             max_cycles=config.rollout_length,
             dtype="uint8",
         )
         self._collector = Collector(
             self._env,
             self._mixture,
-            frames_per_batch=config.rollout_teams * config.rollout_length,
+            frames_per_batch=self._teams * config.rollout_length,
             reset_at_each_iter=True,
             compact_obs=True,
             trust_policy=True,
@@ -124,22 +239,28 @@ class Aggregator:
         self._batches: Iterator[TensorDictBase] = iter(self._collector)
 
     def collect(self, round_number: int, steps: int) -> tuple[Demonstrations, int]:
-        """Play at least `steps` team steps and label them; what a round yields depends on its number and the weights.
+        """Play this process's share of at least `steps` team steps and label them.
+
+        What a round yields depends on its number, the process's and the weights.
 
         Returns:
-            The demonstrations of all states of the round, and the number of those the expert could not solve.
+            The demonstrations of all states of the round, or of plans from where teams were stuck, and the number of
+            states that the expert could not solve.
         """
-        seed = int(np.random.SeedSequence([self._config.seed, round_number]).generate_state(1)[0])
+        seed = int(np.random.SeedSequence([self._config.seed, round_number, self._rank]).generate_state(1)[0])
         self._env.set_seed(seed)
         self._mixture.random.manual_seed(seed)
         self._mixture.beta = self._config.beta_decay**round_number
         self._mixture.policy.eval()
+        stuck_only = self._config.aggregation == "stuck" and round_number > 0
         cases, positions = [], []
         for _ in range(-(-steps // (self._config.rollout_teams * self._config.rollout_length))):
             visited = next(self._batches)
-            cases.append(np.asarray(visited[CASE].flatten()).copy())
-            positions.append(np.asarray(visited[POSITIONS].flatten(0, 1)).copy())
-        return self._teacher.label(np.concatenate(cases), np.concatenate(positions))
+            chosen = visited["next", "truncated"].squeeze(-1) if stuck_only else slice(None)
+            cases.append(np.asarray(visited[CASE][chosen].flatten()).copy())
+            positions.append(np.asarray(visited[POSITIONS][chosen].flatten(0, -3)).copy())
+        ask = self._teacher.demonstrate if stuck_only else self._teacher.label
+        return ask(np.concatenate(cases), np.concatenate(positions))
 
     def close(self) -> None:
         """Shut the collector down."""

@@ -22,6 +22,8 @@ class Round:
     """Time spent so far, over all sessions."""
     collect_seconds: float
     """Time of this round's rollouts and labels."""
+    expert_seconds: float
+    """The part of it that the expert took."""
     fit_seconds: float
     """Time of this round's gradient steps."""
     loss: float

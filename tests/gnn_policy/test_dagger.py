@@ -12,6 +12,7 @@ from gnn_policy import DecentralizedPolicy, PolicyConfig
 from gnn_policy.cases import make_cases
 from gnn_policy.config import TrainConfig
 from gnn_policy.dagger import Aggregator, Mixture, Teacher
+from gnn_policy.demonstrations import BatchMaker
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
 
 STEPS = [(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)]
@@ -38,8 +39,17 @@ def policy():
     return DecentralizedPolicy(CONFIG.policy)
 
 
+def taught_by(cases, **settings):
+    return Teacher(cases, **{"w": 1.05, "node_limit": 2000, "threads": 1, **settings})
+
+
+def aggregating(config, policy, cases):
+    teacher = taught_by(cases, solver=config.teacher, ties=config.ties)
+    return Aggregator(config, policy, teacher, cases)
+
+
 def collected(config, policy, cases, number, steps):
-    aggregator = Aggregator(config, policy, cases, 1)
+    aggregator = aggregating(config, policy, cases)
     try:
         return aggregator.collect(number, steps)
     finally:
@@ -84,7 +94,7 @@ def test_round_zero_is_the_expert_itself(cases, policy):
 
 
 def test_every_team_reaches_its_goals_under_the_expert(cases, policy):
-    mixture = Mixture(policy, Teacher(cases, w=1.05, node_limit=2000, threads=1), sample=False)
+    mixture = Mixture(policy, taught_by(cases), sample=False)
     env = TeamEnv(len(cases), cases, max_cycles=60, fov_radius=2, dtype="uint8")
     state, reached = env.reset(seed=0), set()
     for _ in range(60):
@@ -107,7 +117,7 @@ def test_later_rounds_visit_what_the_policy_does_and_label_what_the_expert_would
 
 def test_collection_plays_the_weights_of_the_moment(cases, policy):
     """The collector must not keep a copy of the policy that training goes on to change."""
-    aggregator = Aggregator(CONFIG, policy, cases, 1)
+    aggregator = aggregating(CONFIG, policy, cases)
     before, _ = aggregator.collect(1, 1)
     again, _ = aggregator.collect(1, 1)
     assert np.array_equal(before.positions, again.positions)
@@ -123,7 +133,7 @@ def test_collection_plays_the_weights_of_the_moment(cases, policy):
 @pytest.mark.parametrize("sample", [False, True])
 def test_a_round_depends_on_seed_number_and_weights_alone(cases, policy, sample):
     config = replace(CONFIG, sample_rollouts=sample, beta_decay=0.5)
-    aggregator = Aggregator(config, policy, cases, 1)
+    aggregator = aggregating(config, policy, cases)
     rounds = {number: aggregator.collect(number, 100)[0] for number in (0, 1, 2)}
     aggregator.close()
     for number in (2, 1):
@@ -134,6 +144,27 @@ def test_a_round_depends_on_seed_number_and_weights_alone(cases, policy, sample)
     assert not np.array_equal(rounds[1].cases[:50], rounds[2].cases[:50])
     other, _ = collected(replace(config, seed=4), policy, cases, 1, 100)
     assert not np.array_equal(other.cases[:50], rounds[1].cases[:50])
+
+
+def test_the_collected_views_are_those_that_training_rebuilds(cases):
+    """The environment shows the mixture what `BatchMaker` makes of positions, whatever the policy perceives."""
+    seen = []
+
+    class Watching(DecentralizedPolicy):
+        def forward(self, fov, graph):
+            seen.append((fov, graph))
+            return super().forward(fov, graph)
+
+    perceived = replace(CONFIG.policy, cost_to_go=True, comm_range="connected", comm_weights="distance")
+    config = replace(CONFIG, policy=perceived, rollout_teams=3, rollout_length=4)
+    states, _ = collected(config, Watching(perceived), cases, 1, 12)
+    batch = BatchMaker(cases, perceived, augment=False).batch(states, np.arange(len(states)), np.random.default_rng(0))
+    shown = {(fov[b].numpy().tobytes(), graph[b].numpy().tobytes()) for fov, graph in seen for b in range(3)}
+    rebuilt = {
+        (fov.numpy().tobytes(), graph.numpy().tobytes()) for fov, graph in zip(batch[FOV], batch[GRAPH], strict=True)
+    }
+    assert len(rebuilt) > 3
+    assert rebuilt == shown
 
 
 def states_at_starts(cases, teams):
@@ -150,7 +181,7 @@ def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
     with torch.no_grad():
         policy.head.weight.zero_()
         policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))  # this policy always stays
-    mixture = Mixture(policy.eval(), Teacher(cases, w=1.05, node_limit=2000, threads=1), sample=False)
+    mixture = Mixture(policy.eval(), taught_by(cases), sample=False)
     mixture.beta = beta
     mixture.random.manual_seed(0)
     state = states_at_starts(cases, 2000)
@@ -165,7 +196,7 @@ def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
 
 def test_sampled_moves_follow_the_softmax(cases, policy):
     policy.eval()
-    mixture = Mixture(policy, Teacher(cases, w=1.05, node_limit=2000, threads=1), sample=True)
+    mixture = Mixture(policy, taught_by(cases), sample=True)
     mixture.beta = 0.0
     state = states_at_starts(cases, 1).expand(4000).contiguous()
     moves = mixture(state)[ACTION].numpy()
@@ -191,7 +222,7 @@ def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
 
 
 def test_labels_keep_the_order_of_the_visits(cases):
-    teacher = Teacher(cases, w=1.05, node_limit=2000, threads=1)
+    teacher = taught_by(cases)
     order = np.array([7, 2, 7, 9, 0, 2])
     states, _ = teacher.label(order, np.stack([cases[i].starts for i in order]))
     assert states.cases.tolist() == order.tolist()
@@ -199,7 +230,7 @@ def test_labels_keep_the_order_of_the_visits(cases):
 
 
 def test_the_mixture_reads_what_the_environment_writes(policy, cases):
-    mixture = Mixture(policy, Teacher(cases, w=1.05, node_limit=2000, threads=1), sample=False)
+    mixture = Mixture(policy, taught_by(cases), sample=False)
     state = TeamEnv(2, cases).reset()
     assert isinstance(state, TensorDict)
     assert set(mixture.in_keys) <= set(state.keys(include_nested=True))

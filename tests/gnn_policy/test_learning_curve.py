@@ -14,6 +14,7 @@ def test_a_png_is_drawn(tmp_path, validated):
             samples=100 * i,
             seconds=1.0,
             collect_seconds=0.5,
+            expert_seconds=0.1,
             fit_seconds=0.5,
             loss=1.0 / (i + 1),
             accuracy=0.5,

@@ -18,6 +18,7 @@ def test_phase_rate_loss_success_and_time_are_shown():
         samples=3_000_000,
         seconds=90.0,
         collect_seconds=1.0,
+        expert_seconds=0.1,
         fit_seconds=1.0,
         loss=0.321,
         accuracy=0.9,

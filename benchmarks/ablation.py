@@ -1,0 +1,273 @@
+"""What makes a good teacher, and what aggregation is worth: `python benchmarks/ablation.py labels` or `dagger`.
+
+Each variant differs from the default in the settings that its name says, and is trained on the same maps for the same
+small number of gradient steps on one thread. A run that is finished is not repeated and one that was interrupted goes
+on where it stopped, so give the command again after an interruption. It writes a table, `labels.md` or `dagger.md`,
+and `dagger.png` into the folder of the runs. Seconds are CPU seconds, which others on the machine do not spoil.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import tyro
+from matplotlib.figure import Figure
+from rich.console import Console
+
+import experts
+from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.dagger import Teacher
+from gnn_policy.evaluation import Estimate, Exam
+from gnn_policy.progress import TrainingProgress
+from gnn_policy.rollout import Teams, rollout
+from gnn_policy.training import Training, split_cases
+from mapf_env.files import replacing, write_whole
+
+Variants = dict[str, dict[str, Any]]
+
+BASE = replace(
+    RECIPES["quick"],
+    epochs=12,
+    updates_per_epoch=800,
+    validation_cases_per_map=10,
+    validate_every=3,
+    threads=1,
+)
+DEFAULT = "default"
+LABELS: Variants = {
+    DEFAULT: {},
+    "w = 1": {"w": 1.0},
+    "w = 1.2": {"w": 1.2},
+    "w = 1.5": {"w": 1.5},
+    "ties by state": {"ties": "varied"},
+    "prioritised": {"teacher": "prioritised"},
+    "LaCAM": {"teacher": "lacam"},
+    "LaCAM improved": {"teacher": "ablation:improved_lacam"},
+    "PIBT": {"teacher": "pibt"},
+}
+DAGGER: Variants = {
+    DEFAULT: {},
+    "none": {"dagger_every": 0},
+    "stuck, every 4th round": {"aggregation": "stuck", "dagger_every": 4, "dagger_steps": 32_768},
+    "stuck, every round": {"aggregation": "stuck"},
+    "fresh 0.25": {"fresh_share": 0.25},
+    "fresh 0.5": {"fresh_share": 0.5},
+    "nodes 20": {"expert_nodes": 20},
+    "beta 0.8": {"beta_decay": 0.8},
+}
+CPU_MINUTES = 4.0
+"""Of a run, on one core of an Intel Xeon at 2.3 GHz; said before there is a finished run to go by."""
+
+improved_lacam = functools.partial(experts.lacam, w=1.05, time_limit=2e-3)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train the variants of one ablation, then write its table."""
+
+    ablation: Annotated[Literal["labels", "dagger"], tyro.conf.Positional]
+    """Who teaches and how ties are broken, or what is aggregated and how it is weighed."""
+    runs: Path = Path("runs/ablation")
+    """The folder of all runs; both ablations share the default's."""
+    seeds: int = 1
+    """Runs of each variant."""
+    only: tuple[str, ...] = ()
+    """Names of variants to train now; the table has all that are finished."""
+    epochs: int = BASE.epochs
+    """Rounds of each run."""
+
+
+def main(options: Options) -> None:
+    console = Console(width=120)
+    variants = LABELS if options.ablation == "labels" else DAGGER
+    unknown = set(options.only) - set(variants)
+    if unknown:
+        raise SystemExit(f"error: no variants {sorted(unknown)}: choose among {list(variants)}")
+    chosen = [name for name in variants if not options.only or name in options.only]
+    queue = [(name, seed) for seed in range(options.seeds) for name in chosen]
+    for place, (name, seed) in enumerate(queue):
+        left = [each for each in queue[place:] if outcome(options.runs, *each) is None]
+        if (name, seed) in left:
+            minutes = expected_minutes(options, variants) * len(left)
+            console.print(f"{len(left)} runs to go, about {minutes:.0f} CPU minutes; now: {name}, seed {seed}")
+            train(options, name, replace(BASE, epochs=options.epochs, seed=seed, **variants[name]), console)
+    found = {
+        (name, seed): result
+        for seed in range(options.seeds)
+        for name in variants
+        if (result := outcome(options.runs, name, seed)) is not None
+    }
+    quality = label_quality(options.runs, console) if options.ablation == "labels" else {}
+    table = markdown(found, quality)
+    write_whole(options.runs / f"{options.ablation}.md", table)
+    console.print(table, highlight=False, markup=False, soft_wrap=True)
+    if options.ablation == "dagger":
+        with replacing(options.runs / "dagger.png") as draft:
+            draw(found, draft)
+
+
+def train(options: Options, name: str, config: TrainConfig, console: Console) -> None:
+    """One run; its outcome is written at its end."""
+    folder = run_folder(options.runs, name, config.seed)
+    progress = TrainingProgress(config.epochs, console)
+    training = Training(config, folder, progress, clock=time.process_time)
+    with progress:
+        training.run()
+    exam = the_exam()
+    played = rollout(training.policy, exam.instances, max_steps=exam.max_steps)
+    spent = np.cumsum([row.collect_seconds + row.fit_seconds for row in training.history])
+    rows = training.history
+    result = {
+        "success": played.success.astype(int).tolist(),
+        "flowtime_increase": float(exam.increase(played.flowtime).mean()),
+        "accuracy": rows[-1].accuracy,
+        "states": rows[-1].demonstrations,
+        "unlabelled": sum(row.unlabelled for row in rows),
+        "samples": rows[-1].samples,
+        "seconds": float(spent[-1]),
+        "expert_seconds": sum(row.expert_seconds for row in rows),
+        "all_seconds": rows[-1].seconds,
+        "curve": [
+            (float(seconds), row.validation_success)
+            for seconds, row in zip(spent, rows, strict=True)
+            if row.validation_success is not None
+        ],
+    }
+    write_whole(folder / "outcome.json", json.dumps(result) + "\n")
+
+
+def run_folder(runs: Path, name: str, seed: int) -> Path:
+    return runs / f"{name.replace(' ', '-').replace('=', '').replace(',', '')}-seed{seed}"
+
+
+def outcome(runs: Path, name: str, seed: int) -> dict[str, Any] | None:
+    file = run_folder(runs, name, seed) / "outcome.json"
+    return json.loads(file.read_text()) if file.exists() else None
+
+
+def expected_minutes(options: Options, variants: Variants) -> float:
+    """Of one run: as long as the finished ones took."""
+    taken = [
+        result["all_seconds"] / 60
+        for name in variants
+        for seed in range(options.seeds)
+        if (result := outcome(options.runs, name, seed)) is not None
+    ]
+    return float(np.mean(taken)) if taken else CPU_MINUTES * options.epochs / BASE.epochs
+
+
+@functools.cache
+def the_exam() -> Exam:
+    """The same validation cases and time limits for all, whatever taught."""
+    return Exam.prepare(split_cases(BASE, "validation"), w=BASE.w, timeout=BASE.timeout, threads=1)
+
+
+class TeacherActor:
+    """Asks the teacher anew in every state and does what it says."""
+
+    border, memory = 1, 0
+
+    def __init__(self, teacher: Teacher) -> None:
+        self.teacher, self.states = teacher, 0
+
+    def act(self, teams: Teams) -> npt.NDArray[np.int8]:
+        """The labels (B, N)."""
+        self.states += len(teams.cases)
+        return self.teacher.moves(teams.cases, teams.positions)[0]
+
+
+def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
+    """How good the labels of each variant are when they are followed from step to step."""
+    file = runs / "quality.json"
+    known: dict[str, dict[str, float]] = json.loads(file.read_text()) if file.exists() else {}
+    exam = the_exam()
+    bounds = np.array([each.lower_bound for each in experts.solve_many(exam.instances, w=1.0)])
+    for name, settings in LABELS.items():
+        if name in known:
+            continue
+        console.print(f"quality of labels: {name}")
+        config = replace(BASE, **settings)
+        teacher = Teacher(
+            exam.instances,
+            solver=config.teacher,
+            w=config.w,
+            ties=config.ties,
+            node_limit=config.expert_nodes,
+            threads=1,
+            clock=time.process_time,
+        )
+        actor = TeacherActor(teacher)
+        played = rollout(actor, exam.instances, max_steps=exam.max_steps)
+        solved = played.success
+        waits = moves = 0
+        for case in np.flatnonzero(solved):
+            solution = played.solutions[case]
+            under_way = np.arange(len(solution.paths) - 1)[:, None] < solution.arrivals
+            waits += int(((np.diff(solution.paths, axis=0) == 0).all(-1) & under_way).sum())
+            moves += int(under_way.sum())
+        known[name] = {
+            "solved": float(solved.mean()),
+            "over_bound": float(played.flowtime[solved].sum() / bounds[solved].sum()),
+            "makespan": float(played.makespan[solved].mean()),
+            "waits": waits / moves,
+            "microseconds": teacher.seconds / actor.states * 1e6,
+        }
+        write_whole(file, json.dumps(known, indent=2) + "\n")
+    return known
+
+
+def markdown(found: dict[tuple[str, int], dict[str, Any]], quality: dict[str, dict[str, float]]) -> str:
+    """One row for each run."""
+    headings = ["variant", "seed", "success, argmax", "flowtime increase", "label accuracy"]
+    if quality:
+        headings += ["labels followed: solved", "flowtime / bound", "makespan", "waits", "us a label"]
+    headings += ["states", "training, s", "of it expert, s"]
+    lines = ["| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
+    for (name, seed), result in found.items():
+        success = Estimate.proportion(np.array(result["success"], np.bool_))
+        cells = [
+            name,
+            str(seed),
+            f"{success.mean:.3f} [{success.low:.3f}, {success.high:.3f}]",
+            f"{result['flowtime_increase']:+.1%}",
+            f"{result['accuracy']:.3f}",
+        ]
+        if quality:
+            labels = quality[name]
+            cells += [
+                f"{labels['solved']:.3f}",
+                f"{labels['over_bound']:.4f}",
+                f"{labels['makespan']:.2f}",
+                f"{labels['waits']:.3f}",
+                f"{labels['microseconds']:.0f}",
+            ]
+        cells += [f"{result['states']:,}", f"{result['seconds']:.0f}", f"{result['expert_seconds']:.1f}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def draw(found: dict[tuple[str, int], dict[str, Any]], path: Path) -> None:
+    """Validation success against CPU seconds of training, a line for each variant, the mean of its seeds."""
+    figure = Figure(figsize=(7.2, 4.4), layout="constrained")
+    axes = figure.subplots()
+    for name in dict.fromkeys(name for name, _ in found):
+        curves = np.array([result["curve"] for (each, _), result in found.items() if each == name])
+        seconds, success = curves.mean(axis=0).T
+        axes.plot(seconds / 60, success, "o-", markersize=4, label=name, linewidth=2.4 if name == DEFAULT else 1.4)
+    axes.set(xlabel="CPU minutes of training, one thread", ylabel="validation success (argmax)", ylim=(0, None))
+    axes.set_xlim(0, None)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=120, format="png")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
