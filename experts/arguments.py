@@ -68,6 +68,8 @@ def seed_number(seed: int) -> int:
 
 
 def _real(value: object, name: str) -> float:
+    if type(value) is float:  # before the slow question
+        return value
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
     return float(value)

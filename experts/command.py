@@ -1,4 +1,4 @@
-"""Solve a scenario, or check a file of paths, from a shell."""
+"""Solve an instance, or check a file of paths, from a shell."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import NoReturn
 from experts import arguments
 from experts.many import SOLVER_NAMES, solver_named
 from experts.paths import load_paths, save_paths
-from mapf_env import animate, load_map, load_scen, random_instance
+from mapf_env import animate, load_instances, load_map, load_scen, random_instance
 from mapf_env.instance import Instance
 
 _EXIT_CODES = """exit status: 0 solved or valid, 1 not solved or invalid, 2 an error in the arguments or a file"""
@@ -43,9 +43,9 @@ def _parser() -> _Parser:
 
     solve = commands.add_parser(
         "solve",
-        help="solve a scenario",
-        description="Solve the first robots of a MovingAI scenario, or robots placed at random on a map, and print "
-        "cost, bound and time.",
+        help="solve an instance",
+        description="Solve the first robots of a MovingAI scenario or of an instance of a set, or robots placed at "
+        "random on a map, and print cost, bound and time.",
         epilog=_EXIT_CODES,
     )
     _add_problem(solve, "problem")
@@ -77,7 +77,7 @@ def _parser() -> _Parser:
     check = commands.add_parser(
         "check",
         help="check a file of paths",
-        description="Check that the paths of a file solve a scenario: all begin at their starts, end on their goals, "
+        description="Check that the paths of a file solve an instance: all begin at their starts, end on their goals, "
         "move a cell at a time over free cells, and no two robots meet or swap.",
         epilog=_EXIT_CODES,
     )
@@ -91,22 +91,46 @@ def _add_problem(parser: argparse.ArgumentParser, name: str) -> None:
     action = parser.add_argument(
         name,
         metavar="FILE",
-        help="a scenario (.scen), whose map is looked for beside it, or a map (.map) for random robots",
+        help="a scenario (.scen), whose map is looked for beside it, a map (.map) for random robots, or a set of "
+        "instances (.json), as mapf_env.save_instances writes it",
     )
     action.required = True
     parser.add_argument("--map", metavar="FILE.map", help="the map of the scenario, if it lies elsewhere")
-    parser.add_argument("--agents", type=int, metavar="N", help="the number of robots (default: all of the scenario)")
+    parser.add_argument(
+        "--agents", type=int, metavar="N", help="the number of robots, the first of a file (default: all)"
+    )
+    parser.add_argument("--index", type=int, metavar="I", help="which instance of a set, from 0 (default: 0)")
     parser.add_argument("--seed", type=int, default=0, help="of random robots and of the solver (default: 0)")
 
 
 def _load(file: str, options: argparse.Namespace, num_agents: int | None) -> Instance:
-    if Path(file).suffix != ".map":
+    kind = Path(file).suffix.lower()
+    if options.map is not None and kind in (".map", ".json"):
+        raise ValueError(f"--map goes with a scenario only: {file} has its map already")
+    if options.index is not None and kind != ".json":
+        raise ValueError(f"--index goes with a set of instances (.json) only, and {file} is none")
+    if kind == ".json":
+        return _of_set(file, options.index or 0, num_agents)
+    if kind != ".map":
         return load_scen(file, num_agents, options.map)
-    if options.map is not None:
-        raise ValueError("--map goes with a scenario only: the map is given already")
     if num_agents is None:
         raise ValueError("robots on a map are placed at random: give --agents N (and --seed S)")
     return random_instance(grid=load_map(file), num_agents=num_agents, seed=options.seed)
+
+
+def _of_set(file: str, index: int, num_agents: int | None) -> Instance:
+    instances = load_instances(file)
+    if not 0 <= index < len(instances):
+        raise ValueError(f"{file} holds {len(instances)} instances, counted from 0: there is no --index {index}")
+    instance = instances[index]
+    if num_agents is None:
+        return instance
+    if not 1 <= num_agents <= instance.num_agents:
+        raise ValueError(
+            f"{num_agents} agents asked for, but instance {index} of {file} has {instance.num_agents}: "
+            f"give --agents in 1..{instance.num_agents}"
+        )
+    return Instance(instance.grid, instance.starts[:num_agents], instance.goals[:num_agents])
 
 
 def _solve(options: argparse.Namespace) -> int:

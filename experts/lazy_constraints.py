@@ -21,8 +21,8 @@ def lacam(
 
     Okumura 2023, "LaCAM: search-based algorithm for quick multi-agent pathfinding": a depth-first search over joint
     states whose successors PIBT makes, complete because all constraints on a successor are tried in the end. A plan is
-    then improved by large neighbourhood search (Li et al. 2021; Okumura 2024, "Engineering LaCAM*") until it costs at
-    most `w` times the sum of the distances, or time is up.
+    then improved by large neighbourhood search (Li et al. 2021) until it costs at most `w` times the sum of the
+    distances, or time is up. This is not LaCAM*, whose plans become optimal in the end.
 
     Args:
         instance: The problem.

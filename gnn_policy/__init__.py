@@ -9,13 +9,18 @@ except ImportError as missing:
     ) from None
 
 from gnn_policy.checkpoint import load, save
+from gnn_policy.execution import Execution
 from gnn_policy.network import DecentralizedPolicy, GraphFilter, PolicyConfig, shift_operator
+from gnn_policy.robot import Message, Robot
 from gnn_policy.rollout import Rollouts, rollout
 
 __all__ = [
     "DecentralizedPolicy",
+    "Execution",
     "GraphFilter",
+    "Message",
     "PolicyConfig",
+    "Robot",
     "Rollouts",
     "load",
     "rollout",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from hashlib import blake2b
 from pathlib import Path
 
 import safetensors
@@ -58,6 +59,14 @@ def load(path: PathLike = PACKAGED) -> DecentralizedPolicy:
 def about(path: PathLike) -> dict[str, str]:
     """The notes that were saved with the policy at `path`; raises as `load` does."""
     return _read(path)[0]
+
+
+def fingerprint(policy: DecentralizedPolicy) -> str:
+    """A hash of the configuration and the weights."""
+    hashed = blake2b(json.dumps(asdict(policy.config)).encode(), digest_size=8)
+    for name, tensor in policy.state_dict().items():
+        hashed.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
+    return hashed.hexdigest()
 
 
 def _file(path: PathLike) -> Path:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
+from gnn_policy.cases import Split
 from gnn_policy.network import PolicyConfig
 from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
@@ -133,6 +134,14 @@ class TrainConfig:
             raise ValueError(f"w must be at least 1 and finite, got {self.w}")
         if self.updates_per_epoch is not None and self.updates_per_epoch < 1:
             raise ValueError(f"updates_per_epoch must be at least 1, got {self.updates_per_epoch}")
+
+    def size_of(self, split: Split) -> tuple[int, int]:
+        """The number of maps of a split, and of cases on each."""
+        return {
+            "train": (self.train_maps, self.cases_per_map),
+            "validation": (self.validation_maps, self.validation_cases_per_map),
+            "test": (self.test_maps, self.cases_per_map),
+        }[split]
 
     def save(self, path: Path) -> None:
         """Write the settings as JSON."""

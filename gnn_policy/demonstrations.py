@@ -14,6 +14,8 @@ import torch
 from tensordict import TensorDict
 
 from gnn_policy import symmetry
+from gnn_policy.network import PolicyConfig
+from gnn_policy.perception import Perception
 from gnn_policy.team_env import FOV, GRAPH
 from mapf_env import Instance, rules
 from mapf_env.files import replacing
@@ -68,13 +70,12 @@ class BatchMaker:
 
     Args:
         instances: The training cases, all of one size.
-        fov_radius: r_FOV.
-        comm_radius: r_COMM.
+        config: What the policy perceives.
         augment: Turn and reflect every state at random.
     """
 
-    def __init__(self, instances: Sequence[Instance], fov_radius: int, comm_radius: float, *, augment: bool) -> None:
-        self._fov_radius, self._comm_radius = fov_radius, comm_radius
+    def __init__(self, instances: Sequence[Instance], config: PolicyConfig, *, augment: bool) -> None:
+        self._perception = Perception(config, instances)
         self._height, self._width = instances[0].grid.shape
         self._symmetries = symmetry.symmetries(self._height, self._width) if augment else np.array([0])
         known: dict[bytes, int] = {}
@@ -82,7 +83,7 @@ class BatchMaker:
         grids = np.frombuffer(b"".join(known), np.bool_).reshape(-1, self._height, self._width)
         self._goals = np.stack([each.goals for each in instances])
         self._obstacles = np.stack(
-            [rules.bordered(symmetry.turn_maps(grids, g), fov_radius, np.uint8) for g in self._symmetries]
+            [rules.bordered(symmetry.turn_maps(grids, g), config.fov_radius, np.uint8) for g in self._symmetries]
         )
 
     def batch(
@@ -95,8 +96,7 @@ class BatchMaker:
         goals = self._turn(self._goals[cases], turn)
         positions = self._turn(demonstrations.positions[chosen], turn)
         obstacles = self._obstacles[choice, self._map_of_case[cases]]
-        fov = rules.observe(obstacles, positions, goals, self._fov_radius)
-        graph = rules.communication_graph(positions, self._comm_radius)
+        fov, graph = self._perception.observe(cases, obstacles, positions, goals)
         labels = symmetry.ACTIONS[turn[:, None], demonstrations.actions[chosen]].astype(np.int64)
         tensors = {key: torch.from_numpy(array) for key, array in ((FOV, fov), (GRAPH, graph), (EXPERT_ACTION, labels))}
         return TensorDict(tensors, batch_size=[len(chosen)])

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 import tyro
@@ -15,8 +15,8 @@ from rich.console import Console
 from gnn_policy import checkpoint
 from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
 from gnn_policy.config import TrainConfig
-from gnn_policy.results import examine
-from gnn_policy.training import split_cases
+from gnn_policy.execution import Execution
+from gnn_policy.results import VARIANTS, examine
 from mapf_env.generation import MapStyle
 
 
@@ -24,15 +24,22 @@ from mapf_env.generation import MapStyle
 class Command:
     """Examine a policy beside the expert and baselines that learn nothing, on the same held-out cases.
 
-    What is not given is as the policy was trained.
+    What is not given is as the policy was trained. Results of other settings are never overwritten.
     """
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = checkpoint.PACKAGED
     """A run folder of training, or a .safetensors file; the policy that comes with the package if not given."""
     num_agents: tuple[int, ...] = ()
     """Team sizes N, one table for each."""
+    rows: tuple[str, ...] = tuple(each.name for each in VARIANTS)
+    """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled" or "stuck"
+    (drawn by stuck robots and their neighbours); for the latter two a temperature; the shield, "idle" or "pibt"; who
+    hears whom, "fixed" or "connected" (the radius grows until the team is connected); edge weights, "binary" or
+    "distance"."""
+    split: Literal["validation", "test"] = "test"
+    """Which maps: "validation" to choose a row by, "test" to report it."""
     maps: int | None = None
-    """How many test maps."""
+    """How many of them."""
     cases_per_map: int | None = None
     """Cases on each of them."""
     height: int | None = None
@@ -49,12 +56,12 @@ class Command:
     """Bound of the expert whose makespans set T_max and whose flowtimes are compared with."""
     timeout: float | None = None
     """T_max in makespans of the expert's solution."""
-    temperature: float = 1.0
-    """Of the sampled policy."""
     seed: int | None = None
     """Of sampling and of the shield's tie-breaking."""
+    failures: int = 0
+    """How many of the worst cases of the first row to replay beside the expert's solutions, in failures.html."""
     out: Path | None = None
-    """Folder for results.json and animation.svg; if not given, evaluation/ in the run folder or beside the file, and
+    """Folder for results.json and pictures; if not given, evaluation/ in the run folder or beside the file, and
     in the working folder for the policy that comes with the package."""
     threads: int = 0
     """CPU threads; 0 takes all that the process may use."""
@@ -67,32 +74,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
             Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.evaluate"
         )
         policy = checkpoint.load(command.run)
-        given = {
-            name: value
-            for name in ("cases_per_map", "height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
-            if (value := getattr(command, name)) is not None
-        }
+        variants = [Execution.parse(row) for row in command.rows]
+        names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
+        given = {name: value for name in names if (value := getattr(command, name)) is not None}
+        prefix = "validation_" if command.split == "validation" else ""
         if command.maps is not None:
-            given["test_maps"] = command.maps
+            given[f"{command.split}_maps"] = command.maps
+        if command.cases_per_map is not None:
+            given[f"{prefix}cases_per_map"] = command.cases_per_map
         config = replace(_trained_with(command.run), **given)
-        instances = {
-            f"{N} robots, {config.test_maps} held-out maps": split_cases(config, "test", N)
-            for N in command.num_agents or (config.num_agents,)
-        }
         folder = command.out or _home(command.run) / "evaluation"
         folder.mkdir(parents=True, exist_ok=True)
         threads = cpu_threads(command.threads)
         torch.set_num_threads(threads)
         examine(
             policy,
-            instances,
+            config,
             folder,
             Console(),
-            w=config.w,
-            timeout=config.timeout,
-            seed=config.seed,
+            num_agents=command.num_agents,
+            variants=variants,
+            split=command.split,
             threads=threads,
-            temperature=command.temperature,
+            failures=command.failures,
         )
 
 

@@ -13,8 +13,10 @@ from rich import box
 from rich.table import Table
 
 import experts
+from gnn_policy.baselines import GreedyActor, RandomActor
+from gnn_policy.execution import Execution
 from gnn_policy.network import DecentralizedPolicy
-from gnn_policy.rollout import GreedyActor, Rollouts, rollout
+from gnn_policy.rollout import Rollouts, rollout
 from mapf_env import Instance, Solution
 
 
@@ -120,31 +122,38 @@ def score(name: str, exam: Exam, rollouts: Rollouts) -> Score:
 def compare(
     exam: Exam,
     policy: DecentralizedPolicy,
+    variants: Sequence[Execution],
     *,
-    temperature: float = 1.0,
     seed: int = 0,
     progress: Callable[[str], None] = lambda phase: None,
-) -> tuple[list[Score], dict[str, Rollouts]]:
-    """The results table of a policy beside the expert and no-learning baselines, on the same cases.
+) -> tuple[list[Score], list[Rollouts]]:
+    """The results table of a policy beside the expert and baselines that learn nothing, on the same cases.
 
     Returns:
-        The rows, and what the policy did, as "argmax" and "sampled".
+        The rows, those of the variants first, and what the policy did in each variant.
     """
-    progress("argmax")
-    argmax = rollout(policy, exam.instances, seed=seed, max_steps=exam.max_steps)
-    progress("sampled")
-    sampled = rollout(policy, exam.instances, sample=True, temperature=temperature, seed=seed, max_steps=exam.max_steps)
-    progress("greedy")
-    greedy = rollout(GreedyActor(exam.instances, seed=seed), exam.instances, seed=seed, max_steps=exam.max_steps)
+    rows, played = [], []
+    mark = ",cost-to-go*" if policy.config.cost_to_go else ""
+    for variant in variants:
+        progress(variant.name)
+        played.append(rollout(policy, exam.instances, seed=seed, max_steps=exam.max_steps, **asdict(variant)))
+        rows.append(score(variant.name + mark, exam, played[-1]))
+    return [*rows, *baselines(exam, seed=seed, progress=progress)], played
+
+
+def baselines(exam: Exam, *, seed: int = 0, progress: Callable[[str], None] = lambda phase: None) -> list[Score]:
+    """The rows of those that learn nothing: random, greedy, greedy with random moves if stuck, PIBT, the expert."""
+    cases, rows = exam.instances, []
+    actors = {
+        "random": RandomActor(),
+        "greedy*": GreedyActor(cases),
+        "greedy,stuck*": GreedyActor(cases, random_when_stuck=True),
+    }
+    for name, actor in actors.items():
+        progress(name)
+        rows.append(score(name, exam, rollout(actor, cases, seed=seed, max_steps=exam.max_steps)))
     progress("PIBT")
-    rows = [
-        score("policy argmax", exam, argmax),
-        score("policy sampled", exam, sampled),
-        score("greedy*", exam, greedy),
-        _pibt_score(exam, seed),
-        _expert_score(exam),
-    ]
-    return rows, {"argmax": argmax, "sampled": sampled}
+    return [*rows, _pibt_score(exam, seed), _expert_score(exam)]
 
 
 def _pibt_score(exam: Exam, seed: int) -> Score:
@@ -178,7 +187,7 @@ def _expert_score(exam: Exam) -> Score:
 def table(title: str, rows: Sequence[Score], exam: Exam) -> Table:
     """The rows for the terminal, at most 80 columns wide."""
     shown = Table(title=title, caption=_caption(exam), box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
-    shown.add_column("", no_wrap=True)
+    shown.add_column("", overflow="fold")
     for heading in ("success rate", "flowtime\nincrease", "of solved\ncases", "make-\nspan", "lat-\nched"):
         shown.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
@@ -210,7 +219,7 @@ def _caption(exam: Exam) -> str:
     lines = [
         f"{len(exam.instances)} cases, 95 % intervals; T_max follows from the expert's makespan",
         f"the expert's flowtime is {over_bound:.4f} x its lower bound",
-        "* knows the whole map and learns nothing",
+        "stuck: robots draw where they are stuck; * knows the whole map",
     ]
     if exam.unsolved:
         lines.append(f"{exam.unsolved} more cases are left out: the expert did not solve them")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from mapf_env import Action
+
+CommRange = Literal["fixed", "connected"]
+CommWeights = Literal["binary", "distance"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,21 +30,39 @@ class PolicyConfig:
     """How many cells a robot sees in each direction (r_FOV)."""
     comm_radius: float = 5.0
     """Robots closer than this hear each other, in cells (r_COMM)."""
+    comm_range: CommRange = "fixed"
+    """"connected": at the start of a case comm_radius grows by 10 % until the team is connected, as in the released
+    code."""
+    comm_weights: CommWeights = "binary"
+    """Weights of the communication graph: 1, or with "distance" 1 / distance."""
+    cost_to_go: bool = False
+    """See how many steps it is to the goal from each cell in view: a fourth channel, which needs the whole map."""
 
     def __post_init__(self) -> None:
-        if self.encoder not in ENCODERS:
-            raise ValueError(f"encoder must be one of {', '.join(ENCODERS)}, got {self.encoder!r}")
+        for name, known in (
+            ("encoder", tuple(ENCODERS)),
+            ("comm_range", get_args(CommRange)),
+            ("comm_weights", get_args(CommWeights)),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
         for name, least in (("features", 1), ("taps", 1), ("fov_radius", 2)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not self.comm_radius >= 0:
             raise ValueError(f"comm_radius must not be negative, got {self.comm_radius}")
+        if self.comm_range == "connected" and self.comm_radius == 0:
+            raise ValueError('comm_radius must be positive to grow, got 0.0 with comm_range "connected"')
+
+    @property
+    def channels(self) -> int:
+        """Channels C of a view."""
+        return 4 if self.cost_to_go else 3
 
 
-def released_encoder(side: int, features: int) -> nn.Sequential:
-    """The CNN of the paper's released code for views (M, 3, side, side), to (M, features)."""
+def released_encoder(channels: int, side: int, features: int) -> nn.Sequential:
+    """The CNN of the paper's released code for views (M, channels, side, side), to (M, features)."""
     layers: list[nn.Module] = []
-    channels = 3
     for width, pool in ((32, True), (32, False), (64, True), (64, False), (128, True)):
         layers += [nn.Conv2d(channels, width, 3, padding=1), nn.BatchNorm2d(width), nn.ReLU()]
         if pool:
@@ -53,11 +74,11 @@ def released_encoder(side: int, features: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Flatten(), nn.Linear(channels * side * side, features), nn.ReLU())
 
 
-def lean_encoder(side: int, features: int) -> nn.Sequential:
-    """Three strided convolutions for views (M, 3, side, side), to (M, features)."""
+def lean_encoder(channels: int, side: int, features: int) -> nn.Sequential:
+    """Three strided convolutions for views (M, channels, side, side), to (M, features)."""
     side = ((side + 1) // 2 + 1) // 2
     return nn.Sequential(
-        nn.Conv2d(3, 48, 3, stride=2, padding=1),
+        nn.Conv2d(channels, 48, 3, stride=2, padding=1),
         nn.BatchNorm2d(48),
         nn.ReLU(),
         nn.Conv2d(48, 64, 3, stride=2, padding=1),
@@ -113,19 +134,31 @@ class DecentralizedPolicy(nn.Module):
     def __init__(self, config: PolicyConfig = PolicyConfig()) -> None:
         super().__init__()
         self.config = config
-        self.encoder = ENCODERS[config.encoder](2 * config.fov_radius + 3, config.features)
+        self.encoder = ENCODERS[config.encoder](config.channels, 2 * config.fov_radius + 3, config.features)
         self.filter = GraphFilter(config.features, config.features, config.taps)
         self.head = nn.Linear(config.features, len(Action))
         self.to(memory_format=torch.channels_last)
 
-    def forward(self, fov: Shaped[Tensor, "B N 3 S S"], graph: Float[Tensor, "B N N"]) -> Float[Tensor, "B N 5"]:
+    def forward(self, fov: Shaped[Tensor, "B N C S S"], graph: Float[Tensor, "B N N"]) -> Float[Tensor, "B N 5"]:
         """Logits over the five moves from views (float or uint8) and adjacency."""
-        side = 2 * self.config.fov_radius + 3
-        if fov.shape[-1] != side:
+        features = self.extract(fov.flatten(0, 1)).unflatten(0, fov.shape[:2])
+        return self.decide(self.filter(features, shift_operator(graph)))
+
+    def extract(self, fov: Shaped[Tensor, "M C S S"]) -> Float[Tensor, "M F"]:
+        """The features that robots extract from their views and communicate."""
+        config = self.config
+        side = 2 * config.fov_radius + 3
+        if fov.shape[-1] != side or fov.shape[-3] != config.channels:
             raise ValueError(
-                f"views are {fov.shape[-2]}x{fov.shape[-1]}, this policy reads {side}x{side}: "
-                f"observe with fov_radius={self.config.fov_radius}"
+                f"views are {fov.shape[-3]}x{fov.shape[-2]}x{fov.shape[-1]}, this policy reads "
+                f"{config.channels}x{side}x{side}: observe with fov_radius={config.fov_radius}, "
+                f"{'with' if config.cost_to_go else 'without'} cost_to_go"
             )
-        views = fov.flatten(0, 1).to(self.head.weight.dtype, memory_format=torch.channels_last)
-        features = self.encoder(views).unflatten(0, fov.shape[:2])
-        return self.head(torch.relu(self.filter(features, shift_operator(graph))))
+        views = fov.to(self.head.weight.dtype, memory_format=torch.channels_last)
+        if config.cost_to_go and fov.dtype == torch.uint8:  # counted from -2 r within the ring
+            views[:, 3, 1:-1, 1:-1] = views[:, 3, 1:-1, 1:-1] / (2 * config.fov_radius) - 1
+        return self.encoder(views)
+
+    def decide(self, filtered: Float[Tensor, "*B F"]) -> Float[Tensor, "*B 5"]:
+        """Logits from what the graph filter gives."""
+        return self.head(torch.relu(filtered))

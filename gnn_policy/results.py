@@ -3,67 +3,135 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from gnn_policy import evaluation
+from gnn_policy import checkpoint, evaluation
+from gnn_policy.cases import Split
+from gnn_policy.config import TrainConfig
+from gnn_policy.execution import Execution
+from gnn_policy.failures import count_failures, worst
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.rollout import Rollouts
-from mapf_env import Instance, animate
+from gnn_policy.training import split_cases
+from mapf_env import EnvConfig, Scene, animate, replay_scenes
 from mapf_env.files import write_whole
+
+VARIANTS = (Execution(), Execution(sample="stuck"), Execution(sample=True))
+"""The rows of a table where nothing else is asked for."""
 
 
 def examine(
     policy: DecentralizedPolicy,
-    instances: dict[str, list[Instance]],
+    config: TrainConfig,
     folder: Path,
     console: Console,
     *,
-    w: float,
-    timeout: float,
-    seed: int,
+    num_agents: Sequence[int] = (),
+    variants: Sequence[Execution] = VARIANTS,
+    split: Split = "test",
     threads: int,
-    temperature: float = 1.0,
+    failures: int = 0,
 ) -> None:
-    """Print one table for each set of instances; write animation.svg and, at the very end, results.json into `folder`.
+    """Print one table for each team size; write animation.svg and, at the very end, results.json into `folder`.
 
     Args:
         policy: Whom to examine.
-        instances: Sets of held-out cases by their titles.
+        config: The held-out cases, the expert's w, T_max in its makespans, and the seed of draws and ties.
         folder: Where the files go.
         console: Where the tables go.
-        w: Bound of the expert whose makespans set T_max and whose flowtimes are compared with.
-        timeout: T_max in makespans of the expert's solution.
-        seed: Of sampling and of the shield's tie-breaking.
+        num_agents: Team sizes N; that of `config` if none is given.
+        variants: How to execute the policy, one row for each.
+        split: Which maps.
         threads: CPU threads of the expert.
-        temperature: Of the sampled policy.
+        failures: How many of the worst cases of the first variant to show beside the expert's solutions, for each team
+            size, in failures.html.
+
+    Raises:
+        ValueError: If there is no variant, or `failures` is negative.
+        FileExistsError: If the folder has results of other settings.
     """
+    if not variants:
+        raise ValueError("there is no way to execute the policy: give at least one row")
+    if failures < 0:
+        raise ValueError(f"failures must not be negative, got {failures}")
+    sizes = tuple(num_agents) or (config.num_agents,)
+    settings = _settings(policy, config, sizes, variants, split)
+    _refuse_to_overwrite(folder / "results.json", settings)
+    cases = {N: split_cases(config, split, N) for N in sizes}
     tables: dict[str, object] = {}
-    shown: Rollouts | None = None
+    shown: list[Rollouts] = []
+    scenes: list[Scene] = []
     with console.status("") as status:
-        for title, cases in instances.items():
+        for N, instances in cases.items():
+            title = f"{N} robots, {settings['maps']} {split} maps"
             status.update(f"{title}: expert")
-            exam = evaluation.Exam.prepare(cases, w=w, timeout=timeout, threads=threads)
-            rows, played = evaluation.compare(
+            exam = evaluation.Exam.prepare(instances, w=config.w, timeout=config.timeout, threads=threads)
+            rows, shown = evaluation.compare(
                 exam,
                 policy,
-                temperature=temperature,
-                seed=seed,
+                variants,
+                seed=config.seed,
                 progress=lambda phase, title=title: status.update(f"{title}: {phase}"),
             )
             console.print(evaluation.table(title, rows, exam))
-            tables[title] = evaluation.as_json(rows, exam)
-            shown = played["sampled"]
-    if shown is not None:
-        case = _worth_watching(shown)
-        outcome = "all on goal" if shown.success[case] else "timed out"
-        title = f"Trained policy, {shown.instances[case].num_agents} robots, unseen map: {outcome}"
-        animate(shown.instances[case], shown.solutions[case], folder / "animation.svg", title=title)
-        console.print(f"animation: {folder / 'animation.svg'}", highlight=False)
-    write_whole(folder / "results.json", json.dumps(tables, indent=2) + "\n")
+            kinds = {each.name: count_failures(played) for each, played in zip(variants, shown, strict=True)}
+            tables[str(N)] = {**evaluation.as_json(rows, exam), "failures": kinds}
+            scenes += worst(shown[0], exam.solutions, failures)
+    best = max(shown, key=lambda played: played.success.mean())
+    case = _worth_watching(best)
+    outcome = "all on goal" if best.success[case] else "timed out"
+    title = f"Trained policy, {best.instances[case].num_agents} robots, unseen map: {outcome}"
+    animate(best.instances[case], best.solutions[case], folder / "animation.svg", title=title)
+    console.print(f"animation: {folder / 'animation.svg'}", highlight=False)
+    if scenes:
+        title = f"The worst cases of {variants[0].name} beside the expert's solutions"
+        radii = EnvConfig(fov_radius=policy.config.fov_radius, comm_radius=policy.config.comm_radius)
+        replay_scenes(scenes, folder / "failures.html", title=title, config=radii)
+        console.print(f"worst cases: {folder / 'failures.html'}", highlight=False)
+    write_whole(folder / "results.json", json.dumps({"settings": settings, "num_agents": tables}, indent=2) + "\n")
     console.print(f"numbers: {folder / 'results.json'}", highlight=False)
+
+
+def _settings(
+    policy: DecentralizedPolicy,
+    config: TrainConfig,
+    num_agents: Sequence[int],
+    variants: Sequence[Execution],
+    split: Split,
+) -> dict[str, Any]:
+    """All that the numbers depend on."""
+    maps, cases_per_map = config.size_of(split)
+    names = ("height", "width", "density", "data_seed", "w", "timeout", "seed")
+    return {
+        "policy": checkpoint.fingerprint(policy),
+        "variants": [variant.name for variant in variants],
+        "num_agents": list(num_agents),
+        "split": split,
+        "maps": maps,
+        "cases_per_map": cases_per_map,
+        "styles": list(config.styles),
+        **{name: getattr(config, name) for name in names},
+    }
+
+
+def _refuse_to_overwrite(path: Path, settings: dict[str, Any]) -> None:
+    if not path.exists():
+        return
+    try:
+        known = json.loads(path.read_text())["settings"]
+        differ = [name for name in settings if known.get(name) != settings[name]]
+    except (json.JSONDecodeError, KeyError, AttributeError, TypeError):
+        differ = ["unknown"]
+    if differ:
+        raise FileExistsError(
+            f"{path} has results of other settings ({', '.join(differ)}): choose another folder with --out, "
+            "or delete the file"
+        )
 
 
 def _worth_watching(played: Rollouts) -> int:

@@ -25,7 +25,7 @@ ENDS = ("done", "terminated", "truncated")
 class TeamEnv(EnvBase):
     """B teams as one TorchRL environment of batch size [B], over `mapf_env.BatchedEnv`.
 
-    It reads `ACTION` (B, N) and writes `FOV` (B, N, 3, F, F), `GRAPH` (B, N, N), `POSITIONS` (B, N, 2), `REWARD`
+    It reads `ACTION` (B, N) and writes `FOV` (B, N, C, F, F), `GRAPH` (B, N, N), `POSITIONS` (B, N, 2), `REWARD`
     (B, N, 1) and `CASE` (B,): which of `cases` a team plays, -1 for a random instance.
 
     Args:
@@ -50,12 +50,15 @@ class TeamEnv(EnvBase):
         config = self._batch.config
         N, side = config.num_agents, config.fov_side
         fov_dtype = torch.uint8 if config.dtype == "uint8" else torch.float32
+        span = (0, 1)
+        if "cost_to_go" in config.extra_channels:
+            span = (0, 4 * config.fov_radius) if config.dtype == "uint8" else (-1, 1)
         last_cell = torch.tensor([config.height - 1, config.width - 1], dtype=torch.int32).expand(num_envs, N, 2)
         teams = torch.Size([num_envs])
         robots = torch.Size([num_envs, N])
         self.observation_spec = Composite(
             agents=Composite(
-                fov=Bounded(0, 1, torch.Size([*robots, 3, side, side]), dtype=fov_dtype),
+                fov=Bounded(*span, torch.Size([*robots, config.num_channels, side, side]), dtype=fov_dtype),
                 graph=Bounded(0, 1, torch.Size([*robots, N]), dtype=torch.float32),
                 positions=Bounded(torch.zeros_like(last_cell), last_cell, torch.Size([*robots, 2]), dtype=torch.int32),
                 shape=teams,

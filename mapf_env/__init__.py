@@ -8,14 +8,14 @@ import pettingzoo
 from mapf_env.ascii_map import parse_instance, parse_map
 from mapf_env.batched_env import BatchedEnv, Observation, Step
 from mapf_env.config import EnvConfig
-from mapf_env.generation import random_cases, random_instance, random_map, random_maps
+from mapf_env.generation import Maze, Rooms, Warehouse, random_cases, random_instance, random_map, random_maps
 from mapf_env.grid_v0 import ENV_ID, GridEnv, env, parallel_env
 from mapf_env.instance import Instance
 from mapf_env.instance_set import instance_hash, load_instances, save_instances
 from mapf_env.joint_v0 import JointEnv, joint_env
 from mapf_env.movingai import load_map, load_scen, save_map, save_scen
 from mapf_env.render import animate, draw
-from mapf_env.replay import replay
+from mapf_env.replay import Scene, replay, replay_scenes
 from mapf_env.rewards import SCHEMES, Rewards
 from mapf_env.rules import Edges, communication_edges, communication_graph
 from mapf_env.solution import MOVES, Action, Conflict, Solution
@@ -31,10 +31,14 @@ __all__ = [
     "GridEnv",
     "Instance",
     "JointEnv",
+    "Maze",
     "Observation",
     "Rewards",
+    "Rooms",
+    "Scene",
     "Solution",
     "Step",
+    "Warehouse",
     "animate",
     "communication_edges",
     "communication_graph",
@@ -53,6 +57,7 @@ __all__ = [
     "random_map",
     "random_maps",
     "replay",
+    "replay_scenes",
     "save_instances",
     "save_map",
     "save_scen",

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from mapf_env.generation import STYLES, MapStyle
+from mapf_env.generation import Style, style_name
 from mapf_env.rewards import SCHEMES, Rewards
 
 Channel = Literal["cost_to_go", "other_goals", "previous_positions"]
@@ -15,7 +15,6 @@ CHANNELS: tuple[Channel, ...] = ("cost_to_go", "other_goals", "previous_position
 """Channels beyond the paper, in the native core's order."""
 
 _CHOICES = {
-    "style": STYLES,
     "comm_range": ("fixed", "connected"),
     "comm_weights": ("binary", "distance"),
     "shield": ("idle", "pibt"),
@@ -41,9 +40,9 @@ class EnvConfig:
     """Columns of the random maps."""
     density: float = 0.1
     """Share of obstacles on the random maps."""
-    style: MapStyle = "cells"
+    style: Style = "cells"
     """Random maps of independent "cells", short "walls" as in the paper's released generator, or of a style that has no
-    density: "maze", "room", "warehouse", "empty"."""
+    density: "maze", "room", "warehouse", whose parts have sizes as `Maze`, `Rooms` or `Warehouse`, and "empty"."""
     fov_radius: int = 4
     """How many cells a robot sees in each direction (the paper's r_FOV)."""
     extra_channels: tuple[Channel, ...] = ()
@@ -93,7 +92,7 @@ class EnvConfig:
             raise ValueError(f"cost_to_go in uint8 needs a fov_radius of at most 63, got {self.fov_radius}")
         if not isinstance(self.reward, Rewards) and self.reward not in SCHEMES:
             raise ValueError(f"reward must be Rewards or one of {', '.join(SCHEMES)}, got {self.reward!r}")
-        if self.style not in ("cells", "walls"):
+        if style_name(self.style) not in ("cells", "walls"):
             return  # whether there is room shows when a map is drawn
         free = self.height * self.width - round(self.density * self.height * self.width)
         if free < max(self.num_agents, 2):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +14,71 @@ from mapf_env.instance import Instance, Obstacles, as_obstacles
 MapStyle = Literal["cells", "walls", "maze", "room", "warehouse", "empty"]
 STYLES: tuple[MapStyle, ...] = ("cells", "walls", "maze", "room", "warehouse", "empty")
 """In the native core's order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Maze:
+    """Corridors between walls one cell thick; the style "maze" with its parts chosen.
+
+    Raises:
+        ValueError: If a part is out of its range.
+        TypeError: If a number of cells is no integer.
+    """
+
+    corridor_width: int = 1
+    """Cells, 1..9999."""
+    loops: float = 0.1
+    """Share of the walls between two corridors that is opened beyond what connects them; 0 leaves one way anywhere."""
+
+    def __post_init__(self) -> None:
+        _check_parts(self)
+        if not 0.0 <= self.loops <= 1.0:
+            raise ValueError(f"the loops of a Maze must lie in [0, 1], got {self.loops}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rooms:
+    """Square rooms between walls one cell thick, with a door between any two neighbours; the style "room".
+
+    Raises:
+        ValueError: If the size is out of its range.
+        TypeError: If it is no integer.
+    """
+
+    room_size: int = 5
+    """Rows and columns of a room, 1..9999."""
+
+    def __post_init__(self) -> None:
+        _check_parts(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Warehouse:
+    """Shelves in rows, the same for every seed; the style "warehouse".
+
+    Raises:
+        ValueError: If a part is out of its range.
+        TypeError: If a number of cells is no integer.
+    """
+
+    shelf_length: int = 10
+    """Columns of a shelf, 1..9999."""
+    shelf_depth: int = 2
+    """Rows of a shelf, 1..9999."""
+    corridor_width: int = 1
+    """Cells between two shelves and along the upper and lower edge, half of those at the sides, 1..9999."""
+
+    def __post_init__(self) -> None:
+        _check_parts(self)
+
+
+Style = MapStyle | Maze | Rooms | Warehouse
+_STYLE_OF: dict[type, MapStyle] = {Maze: "maze", Rooms: "room", Warehouse: "warehouse"}
 Seeds = npt.NDArray[np.uint64]
 
 
 def random_maps(
-    seeds: npt.ArrayLike, *, height: int = 20, width: int = 20, density: float = 0.1, style: MapStyle = "cells"
+    seeds: npt.ArrayLike, *, height: int = 20, width: int = 20, density: float = 0.1, style: Style = "cells"
 ) -> Obstacles:
     """Maps (B, H, W), True is an obstacle, one for each of B seeds; the free cells of a map are connected.
 
@@ -28,9 +89,8 @@ def random_maps(
         density: Share of obstacles; maps of the styles "cells" and "walls" have exactly round(density * H * W) of them,
             the others as many as the style has.
         style: "cells" blocks independent cells, "walls" builds short walls between cells with even coordinates as the
-            paper's released generator does. "maze" has corridors one cell wide with some ways round, "room" rooms of
-            5 x 5 cells with a door between any two neighbours, "warehouse" shelves of 2 x 10 cells with aisles one cell
-            wide (always the same), "empty" no obstacles.
+            paper's released generator does, "empty" has no obstacles. "maze", "room" and "warehouse" are short for
+            `Maze()`, `Rooms()` and `Warehouse()`, whose fields are the sizes of their parts.
 
     Raises:
         ValueError: If the density leaves no room, or the style cannot reach it.
@@ -39,10 +99,9 @@ def random_maps(
         raise ValueError(f"a map needs at least one row and one column, got height={height} and width={width}")
     if not 0.0 <= density < 1.0:
         raise ValueError(f"density must lie in [0, 1), got {density}")
-    if style not in STYLES:
-        raise ValueError(f"style must be one of {', '.join(STYLES)}, got {style!r}")
+    number, parts = STYLES.index(style_name(style)), asdict(style) if not isinstance(style, str) else {}
     obstacles = round(density * height * width)
-    return _native.random_maps(_as_seeds(seeds), height, width, obstacles, STYLES.index(style))
+    return _native.random_maps(_as_seeds(seeds), height, width, obstacles, number, **parts)
 
 
 def random_cases(
@@ -62,7 +121,7 @@ def random_cases(
 
 
 def random_map(
-    *, height: int = 20, width: int = 20, density: float = 0.1, style: MapStyle = "cells", seed: int | None = None
+    *, height: int = 20, width: int = 20, density: float = 0.1, style: Style = "cells", seed: int | None = None
 ) -> Obstacles:
     """One map (H, W) as `random_maps` makes them; without a seed, a different one at each call."""
     return random_maps([_one_seed(seed)], height=height, width=width, density=density, style=style)[0]
@@ -74,7 +133,7 @@ def random_instance(
     width: int = 20,
     density: float = 0.1,
     num_agents: int = 10,
-    style: MapStyle = "cells",
+    style: Style = "cells",
     grid: npt.ArrayLike | None = None,
     seed: int | None = None,
 ) -> Instance:
@@ -92,6 +151,28 @@ def random_instance(
         grids = as_obstacles(grid)[None]
     starts, goals = random_cases(seeds, grids, num_agents)
     return Instance(grids[0], starts[0], goals[0])
+
+
+def style_name(style: Any) -> MapStyle:
+    """The name of a style that is given by name or by its parts.
+
+    Raises:
+        ValueError: If it is neither.
+    """
+    name = _STYLE_OF.get(type(style), style)
+    if name not in STYLES:
+        raise ValueError(f"style must be one of {', '.join(STYLES)}, or a Maze, Rooms or Warehouse, got {style!r}")
+    return name
+
+
+def _check_parts(parts: Maze | Rooms | Warehouse) -> None:
+    for name, size in asdict(parts).items():
+        if name == "loops":
+            continue
+        if not isinstance(size, int | np.integer):
+            raise TypeError(f"the {name} of {type(parts).__name__} must be an integer, got {size!r}")
+        if not 1 <= size <= 9999:
+            raise ValueError(f"the {name} of {type(parts).__name__} must lie in 1..9999, got {size}")
 
 
 def _one_seed(seed: int | None) -> int:

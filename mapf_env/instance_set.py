@@ -20,6 +20,7 @@ from mapf_env.files import PathLike, write_whole
 from mapf_env.instance import Instance, Obstacles
 
 _FORMAT = "mapf-instances"
+_FIELDS = ("map", "starts", "goals", "sha256")
 
 
 def instance_hash(instance: Instance) -> str:
@@ -84,6 +85,9 @@ def _grid(path: PathLike, number: int, rows: Any) -> Obstacles:
 
 
 def _instance(path: PathLike, number: int, entry: Any, grids: list[Obstacles]) -> Instance:
+    missing = [name for name in _FIELDS if not isinstance(entry, dict) or name not in entry]
+    if missing:
+        raise ValueError(f"{path}, instance {number}: {' and '.join(missing)} missing; write the set anew")
     try:
         chosen = entry["map"]
         if type(chosen) is not int or not 0 <= chosen < len(grids):
@@ -91,6 +95,6 @@ def _instance(path: PathLike, number: int, entry: Any, grids: list[Obstacles]) -
         instance = Instance(grids[chosen], entry["starts"], entry["goals"])
         if instance_hash(instance) != entry["sha256"]:
             raise ValueError("it is not what its hash says; the file was changed")
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}, instance {number}: {error}") from error
     return instance

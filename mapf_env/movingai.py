@@ -91,7 +91,7 @@ def load_scen(path: PathLike, num_agents: int | None = None, map_path: PathLike 
     count = available if num_agents is None else operator.index(num_agents)
     if count < 1:
         raise ValueError(
-            f"{path}: the scenario has no entries; give another file"
+            f"{path}, line 1: no entries follow; give another file"
             if num_agents is None
             else f"num_agents must be at least 1, got {num_agents}"
         )
@@ -234,6 +234,8 @@ def _beside(path: PathLike, map_name: str) -> Path:
     parts = PurePosixPath(map_name.replace("\\", "/"))
     folder = Path(path).parent
     for candidate in (folder / map_name, folder / parts, folder / parts.name):
-        if candidate.is_file():
+        if os.path.isfile(candidate):  # False for what can be no file's name too
             return candidate
-    raise FileNotFoundError(f"{path} names the map {map_name!r}, which is not beside it: put it there or give map_path")
+    raise FileNotFoundError(
+        f"{path}, line 2 names the map {map_name!r}, which is not beside it: put it there or give map_path"
+    )

@@ -1,8 +1,10 @@
-"""A solution as one self-contained HTML page that plays, pauses and scrubs; a click on a robot shows what it knows."""
+"""Solutions as one self-contained HTML page that plays, pauses and scrubs; a click on a robot shows what it knows."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 
 from mapf_env import svg
@@ -11,6 +13,18 @@ from mapf_env.files import PathLike, write_whole
 from mapf_env.instance import Instance
 from mapf_env.render import require_drawable
 from mapf_env.solution import Solution
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What a page of replays shows at a time: one instance, and solutions of it side by side on one clock."""
+
+    title: str
+    """Its line in the choice of scenes."""
+    instance: Instance
+    """The map and the goals."""
+    solutions: Mapping[str, Solution]
+    """Paths (T + 1, N, 2) by the name above each; they need not solve the instance, nor be of equal length."""
 
 
 def replay(
@@ -34,14 +48,32 @@ def replay(
         ValueError: If the paths are of another number of agents or leave the map.
         OSError: If the file cannot be written.
     """
-    require_drawable(instance, solution)
+    title = title or f"{instance.num_agents} robots, {len(solution.paths) - 1} steps"
+    return replay_scenes([Scene("", instance, {"": solution})], path, title=title, config=config)
+
+
+def replay_scenes(
+    scenes: Sequence[Scene], path: PathLike | None = None, *, title: str, config: EnvConfig | None = None
+) -> str:
+    """The page of `replay` for several scenes to choose from, each with its solutions side by side.
+
+    Args:
+        scenes: At least one.
+        path: Where to write the page too, if anywhere.
+        title: A line above all of them.
+        config: The settings whose fov_radius and comm_radius are shown; the paper's if not given.
+
+    Raises:
+        ValueError: If there is no scene, one has no solution, or its paths are of another number of agents or leave
+            the map.
+        OSError: If the file cannot be written.
+    """
+    if not scenes:
+        raise ValueError("there are no scenes to show; give at least one")
     config = EnvConfig() if config is None else config
     content = {
-        "title": title or f"{instance.num_agents} robots, {len(solution.paths) - 1} steps",
-        "rows": ["".join("@" if cell else "." for cell in row) for row in instance.grid],
-        "goals": instance.goals.tolist(),
-        "paths": solution.paths.tolist(),
-        "colours": svg.colours(instance.num_agents),
+        "title": title,
+        "scenes": [_plain(scene) for scene in scenes],
         "fov_radius": config.fov_radius,
         "comm_radius": min(config.comm_radius, 1e9),
     }
@@ -51,3 +83,17 @@ def replay(
     if path is not None:
         write_whole(path, page)
     return page
+
+
+def _plain(scene: Scene) -> dict[str, object]:
+    if not scene.solutions:
+        raise ValueError(f"the scene {scene.title!r} has no solution to show; give at least one")
+    for solution in scene.solutions.values():
+        require_drawable(scene.instance, solution)
+    return {
+        "title": scene.title,
+        "rows": ["".join("@" if cell else "." for cell in row) for row in scene.instance.grid],
+        "goals": scene.instance.goals.tolist(),
+        "colours": svg.colours(scene.instance.num_agents),
+        "panels": [{"name": name, "paths": each.paths.tolist()} for name, each in scene.solutions.items()],
+    }

@@ -60,10 +60,13 @@ class Solution:
         array = np.asarray(self.paths)
         if array.ndim != 3 or array.shape[2] != 2 or 0 in array.shape:
             raise ValueError(f"paths must have shape (T + 1, N, 2), got {array.shape}")
-        if not np.issubdtype(array.dtype, np.integer):
+        if array.dtype.kind not in "iu":
             raise TypeError(f"paths must be integers, got dtype {array.dtype}")
-        limits = np.iinfo(np.int32)
-        array = np.array(np.clip(array, limits.min, limits.max), dtype=np.int32, order="C")
+        if array.dtype == np.int32:
+            array = np.array(array, order="C")
+        else:
+            limits = np.iinfo(np.int32)
+            array = np.array(np.clip(array, limits.min, limits.max), dtype=np.int32, order="C")
         array.flags.writeable = False
         object.__setattr__(self, "paths", array)
 

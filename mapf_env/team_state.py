@@ -66,12 +66,12 @@ class TeamState:
 
     @staticmethod
     def empty(num_envs: int, config: EnvConfig) -> TeamState:
-        """Before the first reset; the streams are seeded at random."""
+        """Before the first reset."""
         B, N, border = num_envs, config.num_agents, 2 * config.fov_radius
         padded = config.height + border, config.width + border
         size = padded[0] * padded[1]
         return TeamState(
-            streams=np.array(np.random.SeedSequence().generate_state(B, np.uint64), np.uint64),
+            streams=np.zeros(B, np.uint64),
             episodes=np.zeros(B, np.uint64),
             seeds=np.zeros(B, np.uint64),
             grids=np.ones((B, config.height, config.width), np.bool_),
@@ -96,8 +96,3 @@ class TeamState:
             on_goal=np.zeros((B, N), np.bool_),
             action_mask=np.zeros((B, N, 5), np.int8),
         )
-
-    def begin(self, chosen: npt.NDArray[np.intp] | slice, **begun: npt.ArrayLike) -> None:
-        """Begin episodes of the chosen environments: write the given arrays, and zeros into what counts steps."""
-        for name, value in (dict.fromkeys(("under_way", "arrivals", "times", "ended"), 0) | begun).items():
-            getattr(self, name)[chosen] = value

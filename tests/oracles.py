@@ -115,6 +115,33 @@ def harmless(grid: Grid, before: Sequence[Cell], actions: Sequence[int]) -> list
             chosen[robot] = IDLE
 
 
+def pibt(grid: Grid, team: Sequence[Cell], order: Sequence[int], wishes: Sequence[Sequence[int]]) -> list[int]:
+    """The joint action of PIBT as the paper has it (Okumura et al. 2022, algorithm 1).
+
+    `order` names the robots, the most important first; `wishes[i]` are the five actions, the most wanted first.
+    """
+    free, chosen = free_cells(grid), dict[int, int]()
+
+    def planned(robot: int, pusher: int | None) -> bool:
+        for action in wishes[robot]:
+            there = moved(team[robot], action)
+            taken = any(moved(team[other], chosen[other]) == there for other in chosen)
+            if there not in free or taken or (pusher is not None and there == team[pusher]):
+                continue
+            chosen[robot] = action
+            in_the_way = [other for other, cell in enumerate(team) if cell == there and other not in chosen]
+            if not in_the_way or planned(in_the_way[0], robot):
+                return True
+            del chosen[robot]
+        chosen[robot] = IDLE
+        return False
+
+    for robot in order:
+        if robot not in chosen:
+            planned(robot, None)
+    return [chosen[robot] for robot in range(len(team))]
+
+
 def field_of_view(grid: Grid, positions: Sequence[Cell], goals: Sequence[Cell], robot: int, radius: int) -> Grid:
     """What `robot` sees, (3, 2 * radius + 3, 2 * radius + 3): obstacles, own goal, robots.
 

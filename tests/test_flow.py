@@ -64,19 +64,19 @@ def test_training_leaves_all_that_it_promises(trained: tuple[Path, "subprocess.C
     losses = [float(row["loss"]) for row in rows]
     assert losses[-1] < losses[0] < 1.7, "the policy learns nothing"
     assert [bool(row["validation_success"]) for row in rows] == [False, True, False, True]
-    for words in ("validation success", "policy argmax", "PIBT", "expert", "animation.svg", "learning_curve.png"):
+    for words in ("validation success", "argmax", "stuck,1", "PIBT", "expert", "animation.svg", "learning_curve.png"):
         assert words in done.stdout
 
 
 def test_the_results_make_sense(trained: tuple[Path, "subprocess.CompletedProcess[str]"]) -> None:
-    (table,) = json.loads((trained[0] / "runs" / "quick" / "results.json").read_text()).values()
+    (table,) = json.loads((trained[0] / "runs" / "quick" / "results.json").read_text())["num_agents"].values()
     assert table["cases"] + table["unsolved_by_expert"] == 20
-    argmax, sampled, greedy, pibt, expert = table["rows"]
+    argmax, stuck, sampled, random, greedy, restless, pibt, expert = table["rows"]
     assert expert["success_rate"]["mean"] == 1
     assert expert["flowtime_increase"]["mean"] == 0
     assert pibt["success_rate"]["mean"] > 0.9
     assert greedy["success_rate"]["mean"] > 0.5
-    for row in (argmax, sampled, greedy, pibt):
+    for row in (argmax, stuck, sampled, random, greedy, restless, pibt):
         rate = row["success_rate"]
         assert 0 <= rate["low"] <= rate["mean"] <= rate["high"] <= 1
         assert rate["mean"] <= row["latched"] <= 1

@@ -60,6 +60,11 @@ def test_the_installed_version_is_the_sources() -> None:
     assert importlib.metadata.version("mapf-env") == project["version"]
 
 
+def test_a_citation_names_the_sources_version() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
 def test_the_world_needs_three_libraries() -> None:
     needed = [line for line in importlib.metadata.requires("mapf-env") or [] if "extra ==" not in line]
     names = {line.split(">")[0].split("=")[0].split(" ")[0] for line in needed}

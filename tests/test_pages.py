@@ -1,27 +1,131 @@
-"""The Python of README and docs runs as it stands there, block after block of a page."""
+"""The code of README and docs runs as it stands there, block after block of a page.
 
+Long commands are parsed but not carried out, and commands of installation are looked up.
+
+The pages of docs/frameworks need packages that can't stand beside each other. Each runs in an interpreter of its own
+where its packages are, and is skipped elsewhere; `pytest tests/test_pages.py -k PAGE -s` shows what it measures.
+"""
+
+import ast
+import importlib.util
+import os
 import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
+from experts import command as experts_command
+from gnn_policy import evaluate, play, train
+from mapf_env import random_instance, save_map, save_scen
+
 ROOT = Path(__file__).parents[1]
-PAGES = ["README.md", *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").glob("*.md"))]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PAGES = [
+    str(page.relative_to(ROOT))
+    for page in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+    if "frameworks" not in page.parts
+]
 
 
-def blocks(page: str) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+def blocks(page: str) -> list[tuple[str, str]]:
+    """Language and text of the fenced blocks of a page."""
+    return re.findall(r"^```(.*)\n((?s:.*?))^```", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
+def carry_out(line: str) -> None:
+    """Run a line of a shell, or check that what it calls exists."""
+    words = shlex.split(line, comments=True)
+    if "&&" in words:
+        for part in line.split("&&"):
+            carry_out(part)
+        return
+    match words:
+        case ["." | "source", _] | ["python" | "python3", "-m", "venv", _] | [".venv/bin/pip", "install", "uv"]:
+            return
+        case ["pip", "install", *options]:
+            (target,) = [each for each in options if each != "-e"]
+            extras = re.fullmatch(r"\.(?:\[([\w,]+)\])?", target)
+            assert extras, target
+            assert set((extras[1] or "train").split(",")) <= set(PROJECT["optional-dependencies"])
+        case [".venv/bin/uv", "run", "--extra", extra, *rest]:
+            assert extra in PROJECT["optional-dependencies"]
+            carry_out(shlex.join(rest))
+        case ["python", "-m", "experts", *options]:
+            assert experts_command.main(options) == 0
+        case ["python", "-m", "gnn_policy.play", *options]:
+            play.main([*options, "--threads", "1"])
+        case ["python", "-m", "gnn_policy.evaluate", *options]:
+            evaluate.main([*options, "--threads", "1"])
+        case ["python", "-m", "gnn_policy.train", *options]:
+            if train.parse(options).config.epochs <= 2:
+                train.main([*options, "--threads", "1"])
+        case ["python", "benchmarks/report.py", *options]:
+            subprocess.run([sys.executable, str(ROOT / "benchmarks" / "report.py"), *options], check=True, timeout=120)
+        case ["python", script, *_] if (ROOT / script).is_file():
+            return
+        case ["sphinx-build", "--fail-on-warning", source, _]:  # of the extra "docs"
+            assert (ROOT / source / "conf.py").is_file()
+        case ["bash", script]:
+            assert (ROOT / script).is_file()
+        case [tool, *_]:
+            assert shutil.which(tool), f"{tool} of {line!r} is no command that this project brings"
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if {"python", "sh", "bash"} & {each[0] for each in blocks(page)}]
+)
 def test_the_code_blocks_run_one_after_another(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    instance = random_instance(height=16, width=16, num_agents=50, seed=0)
+    save_map("FILE.map", instance.grid)
+    save_scen("FILE.scen", instance, "FILE.map")
     names: dict[str, object] = {}
-    for block in blocks(page):
-        exec(compile(block, page, "exec"), names)
+    for language, block in blocks(page):
+        if language == "python":
+            exec(compile(block, page, "exec"), names)
+        elif language in ("sh", "bash"):
+            for line in block.splitlines():
+                carry_out(line)
+        else:
+            assert language == "" or language.startswith("{"), f"how to run a block of {language}?"
     if page == "docs/environment.md":
         assert "ask for fewer agents or a lower density" in capsys.readouterr().out
     if page == "README.md":
         assert (tmp_path / "expert.svg").read_text().startswith("<svg")
+    if page == "docs/tutorials/own_map.md":
+        assert {"depot.html", "depot.svg", "again.html", "expert.svg"} <= {each.name for each in tmp_path.iterdir()}
+    if page == "docs/tutorials/train_and_evaluate.md":
+        assert (tmp_path / "runs" / "look" / "evaluation" / "failures.html").is_file()
+
+
+@pytest.mark.parametrize("page", sorted(page.stem for page in (ROOT / "docs" / "frameworks").glob("*.md")))
+def test_a_frameworks_page_runs_where_its_packages_are(page: str, tmp_path: Path) -> None:
+    code = "\n".join(text for language, text in blocks(f"docs/frameworks/{page}.md") if language == "python")
+    missing = sorted(name for name in imported(code) if importlib.util.find_spec(name) is None)
+    if missing:
+        pytest.skip(f"not installed: {', '.join(missing)}")
+    (tmp_path / "page.py").write_text(code, encoding="utf-8")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "page.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    print(done.stdout)
+
+
+def imported(code: str) -> set[str]:
+    """The packages that a program imports."""
+    names = set()
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(str(node.module).split(".")[0])
+    return names

@@ -93,37 +93,39 @@ bool Ecbs::plan_root(double w, std::uint64_t seed, Budget& budget) {
 // search for a bound that proves it good enough, in turns.
 Status Ecbs::persist(int id, const EcbsOptions& options, Budget& budget) {
     if (order_forbids_solution(problem_->grid, problem_->starts, problem_->goals)) return Status::infeasible;
+    if (!hard_) hard_ = std::make_unique<HardCases>();
+    auto& [neighbourhoods, proving] = *hard_;
     const auto path_of = [&](std::size_t robot) { return stored(loaded_[robot]); };
     const bool needs_optimum = options.w <= 1;
     if (!needs_optimum) {
         load(id);
-        neighbourhoods_.begin(*problem_, options.seed, path_of);
+        neighbourhoods.begin(*problem_, options.seed, path_of);
     }
     const auto node_limit = options.node_limit - std::min(options.node_limit, nodes_.size());
     for (int effort = first_effort;; effort += effort) {
         std::int64_t known = std::numeric_limits<std::int64_t>::max();
         if (!needs_optimum) {
             const auto target = static_cast<std::int64_t>(std::floor(options.w * lower_bound_));
-            const bool enough = neighbourhoods_.run(target, effort, budget);
-            if (neighbourhoods_.feasible()) known = neighbourhoods_.cost();
+            const bool enough = neighbourhoods.run(target, effort, budget);
+            if (neighbourhoods.feasible()) known = neighbourhoods.cost();
             if (enough) return finish(Author::repair, known);
         }
         if (!proves_) {
             load(0);
-            proving_.begin(*problem_, path_of);
+            proving.begin(*problem_, path_of);
             proves_ = true;
         }
-        const auto nodes = proving_.generated() + static_cast<std::size_t>(effort);
+        const auto nodes = proving.generated() + static_cast<std::size_t>(effort);
         const auto outcome =
-            proving_.run(options.w, known, needs_optimum ? node_limit : std::min(node_limit, nodes), budget);
-        lower_bound_ = std::max(lower_bound_, static_cast<int>(proving_.lower_bound()));
+            proving.run(options.w, known, needs_optimum ? node_limit : std::min(node_limit, nodes), budget);
+        lower_bound_ = std::max(lower_bound_, static_cast<int>(proving.lower_bound()));
         if (outcome == ProvingSearch::Outcome::infeasible) return Status::infeasible;
         if (outcome == ProvingSearch::Outcome::proved) {
-            const bool own = proving_.has_plan() && proving_.cost() <= known;
-            return finish(own ? Author::proof : Author::repair, own ? proving_.cost() : known);
+            const bool own = proving.has_plan() && proving.cost() <= known;
+            return finish(own ? Author::proof : Author::repair, own ? proving.cost() : known);
         }
         if (budget.look()) return Status::time_limit;
-        if (proving_.generated() >= node_limit) return Status::node_limit;
+        if (proving.generated() >= node_limit) return Status::node_limit;
     }
 }
 

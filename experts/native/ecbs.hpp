@@ -3,6 +3,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <memory>
 #include <optional>
 #include <span>
 #include <vector>
@@ -37,15 +38,15 @@ public:
     // Of the last search. Each robot's actions until it arrives, if it was solved.
     std::span<const std::uint8_t> actions(std::size_t robot) const {
         switch (author_) {
-            case Author::repair: return neighbourhoods_.actions(robot);
-            case Author::proof: return proving_.actions(robot);
+            case Author::repair: return hard_->neighbourhoods.actions(robot);
+            case Author::proof: return hard_->proving.actions(robot);
             default: return stored(loaded_[robot]);
         }
     }
     int cost() const { return cost_; }
     int lower_bound() const { return lower_bound_; }
-    std::size_t expansions() const { return expansions_ + (proves_ ? proving_.expansions() : 0); }
-    std::size_t generated() const { return nodes_.size() + (proves_ ? proving_.generated() : 0); }
+    std::size_t expansions() const { return expansions_ + (proves_ ? hard_->proving.expansions() : 0); }
+    std::size_t generated() const { return nodes_.size() + (proves_ ? hard_->proving.generated() : 0); }
 
 private:
     // Robot `robot` must not arrive in `cell` at `time` by any of `actions` (a bit each).
@@ -68,6 +69,11 @@ private:
     struct Occupant {
         std::uint64_t stamp;
         int robot;
+    };
+
+    struct HardCases {
+        NeighbourhoodSearch neighbourhoods;
+        ProvingSearch proving;
     };
 
     bool plan_root(double w, std::uint64_t seed, Budget& budget);
@@ -93,8 +99,7 @@ private:
     std::vector<std::uint8_t> actions_;  // of all paths, one after the other
     OpenList open_;
     SpaceTimeSearch search_;
-    NeighbourhoodSearch neighbourhoods_;
-    ProvingSearch proving_;
+    std::unique_ptr<HardCases> hard_;  // made for the first hard case
     Author author_ = Author::focal;  // of the solution
     bool proves_ = false;  // whether the proving search is of this problem
     Traffic traffic_;

@@ -52,11 +52,14 @@ private:
         std::int16_t rows, cols;  // below and right of the start
     };
 
-    int residue(int cell) const {
-        return residues_[static_cast<std::size_t>(cell) / cells_in_byte] >> 2 * (cell % 4) & 3;
-    }
+    int residue(int cell) const { return residues_[byte_of(cell)] >> shift_of(cell) & 3; }
+    static std::size_t byte_of(int cell) { return static_cast<unsigned>(cell) / cells_in_byte; }
+    static int shift_of(int cell) { return 2 * (cell & 3); }
 
+    // Goes on until the distance of `cell` is known. The hot loop of large maps.
     void search(int cell) {
+        const std::uint8_t* const blocked = grid_->blocked.data();
+        std::uint8_t* const residues = residues_.data();
         while (residue(cell) == unknown) {
             if (now_.empty()) {
                 if (later_.empty()) return;
@@ -65,18 +68,21 @@ private:
             }
             const auto here = now_.back();
             now_.pop_back();
-            if (residue(here.cell) != unknown) continue;
-            const int found = estimate_ - std::abs(here.rows) - std::abs(here.cols);
-            residues_[static_cast<std::size_t>(here.cell) / cells_in_byte] |=
-                static_cast<std::uint8_t>((1 + found % 3) << 2 * (here.cell % 4));
-            const std::array<bool, idle> nearer{here.rows > 0, here.cols > 0, here.rows < 0, here.cols < 0};
-            for (int action = 0; action < idle; ++action) {
+            auto& known = residues[byte_of(here.cell)];
+            if (known >> shift_of(here.cell) & 3) continue;
+            const auto found = static_cast<unsigned>(estimate_ - std::abs(here.rows) - std::abs(here.cols));
+            known = static_cast<std::uint8_t>(known | (1 + found % 3) << shift_of(here.cell));
+            const auto open = [&](int action, bool nearer) {
                 const int next = here.cell + steps_[action];
-                if (grid_->blocked[next] || residue(next) != unknown) continue;
-                (nearer[action] ? now_ : later_)
+                if ((residues[byte_of(next)] >> shift_of(next) & 3) != unknown || blocked[next]) return;
+                (nearer ? now_ : later_)
                     .push_back({next, static_cast<std::int16_t>(here.rows + row_step[action]),
                                 static_cast<std::int16_t>(here.cols + col_step[action])});
-            }
+            };
+            open(0, here.rows > 0);
+            open(1, here.cols > 0);
+            open(2, here.rows < 0);
+            open(3, here.cols < 0);
         }
     }
 

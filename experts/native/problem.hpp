@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "experts/native/budget.hpp"
+#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/grid.hpp"
 
 namespace mapf {

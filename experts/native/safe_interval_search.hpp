@@ -8,6 +8,7 @@
 #include "experts/native/budget.hpp"
 #include "experts/native/cell_time_table.hpp"
 #include "experts/native/reservations.hpp"
+#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/grid.hpp"
 
 namespace mapf {

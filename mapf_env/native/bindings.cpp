@@ -9,6 +9,7 @@
 #include <tuple>
 
 #include "mapf_env/native/arrays.hpp"
+#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/generate.hpp"
 #include "mapf_env/native/goals.hpp"
 #include "mapf_env/native/grid.hpp"
@@ -94,14 +95,17 @@ Out<std::int32_t> distances(In<bool, 2> grid, In<std::int32_t, 2> cells) {
     return out;
 }
 
-Out<bool> random_maps(In<std::uint64_t, 1> seeds, int height, int width, int obstacles, int kind) {
+Out<bool> random_maps(In<std::uint64_t, 1> seeds, int height, int width, int obstacles, int kind, int corridor_width,
+                      double loops, int room_size, int shelf_length, int shelf_depth) {
     auto [grid, out] = make_array<bool>({seeds.shape(0), static_cast<std::size_t>(height), static_cast<std::size_t>(width)});
     require(kind >= 0 && kind <= static_cast<int>(mapf::Style::empty), "there is no such style");
+    require(std::min({corridor_width, room_size, shelf_length, shelf_depth}) >= 1, "the parts of a map have a size");
     const auto style = static_cast<mapf::Style>(kind);
+    const mapf::Parts parts{corridor_width, loops, room_size, shelf_length, shelf_depth};
     nb::gil_scoped_release release;
     for (std::size_t b = 0; b < seeds.shape(0); ++b) {
         mapf::Random random(mapf::seed_for(mapf::Use::map, seeds(b)));
-        const auto map = mapf::random_map(style, height, width, obstacles, random);
+        const auto map = mapf::random_map(style, parts, height, width, obstacles, random);
         write_obstacles(map, grid + b * height * width);
     }
     return out;
@@ -291,22 +295,6 @@ Out<mapf::Distance> distance_tables(In<T, 3> obstacles, int pad, In<std::int32_t
     return out;
 }
 
-// The connected region of each cell of maps in their borders, (B, size); -1 on obstacles.
-template <class T>
-Out<std::int32_t> regions(In<T, 3> obstacles, int pad) {
-    const auto layout = layout_of(obstacles, pad);
-    const std::size_t size = layout.size();
-    auto [labels, out] = make_array<std::int32_t>({obstacles.shape(0), size});
-    std::vector<std::int32_t> inner(static_cast<std::size_t>(layout.height) * layout.width);
-    std::fill_n(labels, obstacles.shape(0) * size, -1);
-    for (std::size_t b = 0; b < obstacles.shape(0); ++b, labels += size) {
-        mapf::label_components(mapf::grid_of(layout, obstacles.data() + b * size), inner.data());
-        for (int row = 0; row < layout.height; ++row)
-            std::copy_n(inner.data() + row * layout.width, layout.width, labels + layout.cell(row, 0));
-    }
-    return out;
-}
-
 template <class T>
 Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, In<float, 3> values,
                              In<std::int64_t, 2> actions, In<std::int32_t, 2> under_way, In<std::uint64_t, 1> seeds,
@@ -388,8 +376,6 @@ void define_for_dtype(nb::module_& m) {
           "radius"_a, "channel"_a, "out"_a.noconvert(), "Write a channel beyond the paper into out (B, N, side, side).");
     m.def("distance_tables", &distance_tables<T>, "obstacles"_a, "pad"_a, "goals"_a,
           "(B, N, size) uint16 steps from each cell of the bordered map to each goal; 65535 where there is no way.");
-    m.def("regions", &regions<T>, "obstacles"_a, "pad"_a,
-          "(B, size) int32 connected region of each cell of the bordered maps; -1 on obstacles.");
     m.def("pibt_shield", &pibt_shield<T>, "obstacles"_a, "pad"_a, "positions"_a, "values"_a, "actions"_a,
           "under_way"_a, "seeds"_a, "times"_a,
           "(B, N) int8 actions by priority inheritance, from values (B, N, 5) or, if these are empty, actions (B, N).");
@@ -405,7 +391,10 @@ NB_MODULE(_native, m) {
           "(H, W) int32 label of the connected free region of each cell; -1 on obstacles.");
     m.def("distances", &distances, "grid"_a, "cells"_a,
           "(M, H, W) int32 steps from each cell to each of M free cells (M, 2); -1 where there is no way.");
+    const mapf::Parts parts;
     m.def("random_maps", &random_maps, "seeds"_a, "height"_a, "width"_a, "obstacles"_a, "style"_a,
+          "corridor_width"_a = parts.corridor_width, "loops"_a = parts.loops, "room_size"_a = parts.room_size,
+          "shelf_length"_a = parts.shelf_length, "shelf_depth"_a = parts.shelf_depth,
           "(B, H, W) bool maps with connected free cells, one for each seed; with that many obstacles if the style takes any.");
     m.def("place_agents", &place_agents, "seeds"_a, "grids"_a, "num_agents"_a,
           "Starts and goals (B, N, 2) int32, uniform over the largest connected region of each grid (B, H, W).");

@@ -1,7 +1,9 @@
 #include "mapf_env/native/generate.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <numeric>
+#include <stdexcept>
 #include <string>
 
 namespace mapf {
@@ -99,7 +101,12 @@ void add_cells(MapBuilder& map, int obstacles, Random& random) {
     std::vector<int> cells;
     for (int row = 0; row < layout.height; ++row)
         for (int col = 0; col < layout.width; ++col) cells.push_back(layout.cell(row, col));
-    random.shuffle_front(cells, static_cast<int>(cells.size()));
+    // Drawn as they are needed: most maps have few obstacles.
+    const int count = static_cast<int>(cells.size());
+    for (int i = 0; i < count && map.obstacles() < obstacles; ++i) {
+        std::swap(cells[i], cells[i + random.below(count - i)]);
+        map.try_block(cells[i]);
+    }
     // A cell that would cut the map may become removable once its surroundings are full: go round again. Some free
     // cell can always be blocked without a cut, so every round makes progress.
     while (map.obstacles() < obstacles)
@@ -146,10 +153,10 @@ struct Sheet {
     std::uint8_t& at(int row, int col) { return cells[static_cast<std::size_t>(row) * width + col]; }
 };
 
-// A spanning tree of the cells with even coordinates, drawn by a random walk that backtracks; a tenth of the other
-// links is opened too, so that there are ways round.
-void carve_maze(Sheet& sheet, Random& random) {
-    constexpr int closed_of_ten = 9;
+// A spanning tree of the cells with even coordinates, drawn by a random walk that backtracks; a share of the other links
+// is opened too, so that there are ways round.
+void carve_maze(Sheet& sheet, double loops, Random& random) {
+    const long closed_of_thousand = 1000 - std::lround(1000 * loops);
     const auto inside = [&](int row, int col) {
         return row >= 0 && row < sheet.height && col >= 0 && col < sheet.width;
     };
@@ -175,14 +182,29 @@ void carve_maze(Sheet& sheet, Random& random) {
     for (int row = 0; row < sheet.height; ++row)
         for (int col = (row + 1) % 2; col < sheet.width; col += 2) {
             const bool links = row % 2 ? row + 1 < sheet.height : col + 1 < sheet.width;
-            if (links && sheet.at(row, col) && random.below(10) >= closed_of_ten) sheet.at(row, col) = 0;
+            if (links && sheet.at(row, col) && random.below(1000) >= closed_of_thousand) sheet.at(row, col) = 0;
         }
 }
 
-// Rooms of 5 x 5 cells, smaller at the lower and right edge, between walls one cell thick.
-void build_rooms(Sheet& sheet, Random& random) {
-    constexpr int side = 5, period = side + 1;
-    const auto is_wall = [](int place, int extent) { return place % period == side && place + 1 < extent; };
+// A maze whose corridors are `corridor_width` cells wide, narrower at the lower and right edge, between walls one cell
+// thick.
+void build_maze(Sheet& sheet, const Parts& parts, Random& random) {
+    const int period = parts.corridor_width + 1;
+    Sheet plan(2 * ((sheet.height - 1) / period) + 1, 2 * ((sheet.width - 1) / period) + 1, 1);
+    carve_maze(plan, parts.loops, random);
+    const auto planned = [&](int place) { return 2 * (place / period) + (place % period == parts.corridor_width); };
+    for (int row = 0; row < sheet.height; ++row)
+        for (int col = 0; col < sheet.width; ++col) {
+            const int from_row = planned(row), from_col = planned(col);
+            const bool inside = from_row < plan.height && from_col < plan.width;
+            sheet.at(row, col) = inside ? plan.at(from_row, from_col) : 1;
+        }
+}
+
+// Square rooms, smaller at the lower and right edge, between walls one cell thick.
+void build_rooms(Sheet& sheet, const Parts& parts, Random& random) {
+    const int side = parts.room_size, period = side + 1;
+    const auto is_wall = [&](int place, int extent) { return place % period == side && place + 1 < extent; };
     for (int row = 0; row < sheet.height; ++row)
         for (int col = 0; col < sheet.width; ++col)
             sheet.at(row, col) = is_wall(row, sheet.height) || is_wall(col, sheet.width);
@@ -197,17 +219,18 @@ void build_rooms(Sheet& sheet, Random& random) {
         for (int row = side; is_wall(row, sheet.height); row += period) sheet.at(row, door(col, sheet.width)) = 0;
 }
 
-// Shelves of 2 x 10 cells in a margin of one row and two columns.
-void place_shelves(Sheet& sheet) {
-    constexpr int depth = 2, length = 10;
-    for (int row = 1; row < sheet.height - 1; ++row)
-        for (int col = 2; col < sheet.width - 2; ++col)
-            sheet.at(row, col) = (row - 1) % (depth + 1) < depth && (col - 2) % (length + 1) < length;
+// Shelves along the rows, in a margin as wide as a corridor above and below and as two at the sides.
+void place_shelves(Sheet& sheet, const Parts& parts) {
+    const int aisle = parts.corridor_width, depth = parts.shelf_depth, length = parts.shelf_length;
+    for (int row = aisle; row < sheet.height - aisle; ++row)
+        for (int col = 2 * aisle; col < sheet.width - 2 * aisle; ++col)
+            sheet.at(row, col) =
+                (row - aisle) % (depth + aisle) < depth && (col - 2 * aisle) % (length + aisle) < length;
 }
 
 }  // namespace
 
-Grid random_map(Style style, int height, int width, int obstacles, Random& random) {
+Grid random_map(Style style, const Parts& parts, int height, int width, int obstacles, Random& random) {
     if (style == Style::cells || style == Style::walls) {
         MapBuilder map(height, width);
         if (obstacles >= height * width)
@@ -217,10 +240,10 @@ Grid random_map(Style style, int height, int width, int obstacles, Random& rando
         style == Style::cells ? add_cells(map, obstacles, random) : add_walls(map, obstacles, random);
         return std::move(map).finish();
     }
-    Sheet sheet(height, width, style == Style::maze);
-    if (style == Style::maze) carve_maze(sheet, random);
-    if (style == Style::room) build_rooms(sheet, random);
-    if (style == Style::warehouse) place_shelves(sheet);
+    Sheet sheet(height, width, 0);
+    if (style == Style::maze) build_maze(sheet, parts, random);
+    if (style == Style::room) build_rooms(sheet, parts, random);
+    if (style == Style::warehouse) place_shelves(sheet, parts);
     return {sheet.cells.data(), height, width};
 }
 

@@ -5,8 +5,6 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
-#include <limits>
-#include <stdexcept>
 #include <utility>
 #include <vector>
 
@@ -18,9 +16,6 @@ inline constexpr int idle = 4;
 // The moves in the paper's order: up, left, down, right, idle.
 inline constexpr std::array<int, num_actions> row_step{-1, 0, 1, 0, 0};
 inline constexpr std::array<int, num_actions> col_step{0, -1, 0, 1, 0};
-
-using Distance = std::uint16_t;
-inline constexpr Distance unreachable = std::numeric_limits<Distance>::max();
 
 // Geometry of a height x width map inside a border of `pad` obstacle cells.
 struct Layout {
@@ -39,7 +34,7 @@ struct Layout {
 // Obstacles of one map inside a border, one cell wide or as wide as a kernel needs.
 struct Grid {
     Layout layout;
-    std::vector<std::uint8_t> blocked;
+    std::vector<std::uint8_t> blocked;  // 1 or 0
 
     // Takes over a map that has its border.
     Grid(const Layout& layout, std::vector<std::uint8_t> blocked) : layout(layout), blocked(std::move(blocked)) {}
@@ -52,35 +47,6 @@ struct Grid {
                 blocked[layout.cell(row, col)] = obstacles[static_cast<std::size_t>(row) * width + col] != 0;
     }
 };
-
-// Steps from every cell to `goal` by breadth-first search, `unreachable` where there is no way. `queue` is scratch.
-// Throws std::overflow_error if a distance does not fit.
-inline void distances_to(const Grid& grid, int goal, std::vector<Distance>& distance, std::vector<int>& queue) {
-    const std::size_t size = grid.blocked.size();
-    distance.resize(size);
-    queue.resize(size);
-    // Obstacles count as visited until the end, so that one comparison without a branch tells what is new.
-    for (std::size_t cell = 0; cell < size; ++cell) distance[cell] = grid.blocked[cell] ? 0 : unreachable;
-    const auto steps = grid.layout.steps();
-    Distance* const found = distance.data();
-    int* const open = queue.data();
-    std::size_t head = 0, tail = 0;
-    found[goal] = 0;
-    open[tail++] = goal;
-    while (head < tail) {
-        const int cell = open[head++];
-        const auto next = static_cast<Distance>(found[cell] + 1);
-        if (next == unreachable) throw std::overflow_error("a shortest path on this map is longer than 65533 steps");
-        for (int action = 0; action < idle; ++action) {
-            const int neighbour = cell + steps[action];
-            const bool is_new = found[neighbour] == unreachable;
-            found[neighbour] = is_new ? next : found[neighbour];
-            open[tail] = neighbour;
-            tail += is_new;
-        }
-    }
-    for (std::size_t cell = 0; cell < size; ++cell) distance[cell] = grid.blocked[cell] ? unreachable : distance[cell];
-}
 
 // Numbers the connected free regions 0, 1, ... in `labels` (height * width, row-major); obstacles are -1.
 inline void label_components(const Grid& grid, std::int32_t* labels) {

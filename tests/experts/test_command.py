@@ -7,7 +7,7 @@ import pytest
 
 import experts
 from experts.command import main
-from mapf_env import Instance, Solution, random_instance, save_map, save_scen
+from mapf_env import Instance, Solution, random_instance, save_instances, save_map, save_scen
 
 
 @pytest.fixture
@@ -42,6 +42,32 @@ def test_some_robots_of_a_scenario_and_random_ones_on_a_map(scen: Path, capsys: 
     assert "starts at" in capsys.readouterr().out
 
 
+def test_an_instance_of_a_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    instances = [random_instance(height=8, width=8, num_agents=5, seed=seed) for seed in range(3)]
+    several, paths = str(tmp_path / "several.json"), str(tmp_path / "paths.txt")
+    save_instances(several, instances)
+    for index, given in enumerate([[], ["--index", "1"], ["--index", "2"]]):
+        assert main(["solve", several, *given, "--w", "1", "--paths", paths]) == 0
+        assert experts.load_paths(paths).violations(instances[index]) == []
+        assert main(["check", paths, "--scen", several, *given]) == 0
+    assert main(["check", paths, "--scen", several]) == 1
+    assert main(["solve", several, "--index", "1", "--agents", "3", "--paths", paths]) == 0
+    first = Instance(instances[1].grid, instances[1].starts[:3], instances[1].goals[:3])
+    assert experts.load_paths(paths).violations(first) == []
+    capsys.readouterr()
+    for given, message in [
+        (["--index", "3"], "holds 3 instances, counted from 0: there is no --index 3"),
+        (["--index", "-1"], "there is no --index -1"),
+        (["--agents", "6"], "6 agents asked for, but instance 0"),
+        (["--agents", "0"], "give --agents in 1..5"),
+        (["--map", "x.map"], "--map goes with a scenario only"),
+    ]:
+        assert main(["solve", several, *given]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+
+
 def test_an_invalid_plan_is_named(scen: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = scen.with_name("paths.txt")
     main(["solve", str(scen), "--paths", str(paths)])
@@ -68,6 +94,8 @@ def test_no_plan_is_status_1(scen: Path, capsys: pytest.CaptureFixture[str]) -> 
         (["solve", "{scen}", "--w", "0.5"], "w must be a finite number"),
         (["solve", "{scen}", "--agents", "99"], "99 agents asked for"),
         (["solve", "{map}"], "give --agents N"),
+        (["solve", "{scen}", "--index", "1"], "--index goes with a set of instances"),
+        (["solve", "{map}", "--map", "{map}", "--agents", "2"], "--map goes with a scenario only"),
         (["check", "{scen}", "--scen", "{scen}"], "line 1: expected 'Agent 0:"),
     ],
 )

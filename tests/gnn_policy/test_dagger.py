@@ -16,6 +16,7 @@ from gnn_policy import DecentralizedPolicy, PolicyConfig
 from gnn_policy.cases import make_cases
 from gnn_policy.config import TrainConfig
 from gnn_policy.dagger import Aggregator, Mixture, Teacher
+from gnn_policy.demonstrations import BatchMaker
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
 from mapf_env import Instance
 
@@ -148,6 +149,27 @@ def test_a_round_depends_on_seed_number_and_weights_alone(cases, policy, sample)
     assert not np.array_equal(rounds[1].cases[:50], rounds[2].cases[:50])
     other, _ = collected(replace(config, seed=4), policy, cases, 1, 100)
     assert not np.array_equal(other.cases[:50], rounds[1].cases[:50])
+
+
+def test_the_collected_views_are_those_that_training_rebuilds(cases):
+    """The environment shows the mixture what `BatchMaker` makes of positions, whatever the policy perceives."""
+    seen = []
+
+    class Watching(DecentralizedPolicy):
+        def forward(self, fov, graph):
+            seen.append((fov, graph))
+            return super().forward(fov, graph)
+
+    perceived = replace(CONFIG.policy, cost_to_go=True, comm_range="connected", comm_weights="distance")
+    config = replace(CONFIG, policy=perceived, rollout_teams=3, rollout_length=4)
+    states, _ = collected(config, Watching(perceived), cases, 1, 12)
+    batch = BatchMaker(cases, perceived, augment=False).batch(states, np.arange(len(states)), np.random.default_rng(0))
+    shown = {(fov[b].numpy().tobytes(), graph[b].numpy().tobytes()) for fov, graph in seen for b in range(3)}
+    rebuilt = {
+        (fov.numpy().tobytes(), graph.numpy().tobytes()) for fov, graph in zip(batch[FOV], batch[GRAPH], strict=True)
+    }
+    assert len(rebuilt) > 3
+    assert rebuilt == shown
 
 
 def states_at_starts(cases, teams):

@@ -1,17 +1,22 @@
 """Demonstrations: what training sees is what play sees, and files are whole or say so."""
 
+import math
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import safetensors.numpy
+import torch
 
 from gnn_policy.cases import make_cases
 from gnn_policy.demonstrations import EXPERT_ACTION, BatchMaker, Demonstrations
+from gnn_policy.network import DecentralizedPolicy, PolicyConfig
 from gnn_policy.team_env import FOV, GRAPH
 from mapf_env import parallel_env
 
 SHAPES = [(7, 7), (5, 9)]
+PERCEIVED = PolicyConfig(encoder="lean", fov_radius=2, comm_radius=3.0)
 STEPS = [(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)]
 
 
@@ -40,24 +45,59 @@ def random_states(shape, count=40, seed=0):
     return cases, Demonstrations(chosen.astype(np.int32), positions.astype(np.int16), moves.astype(np.int8))
 
 
-def seen_in_play(case, positions, radius, comm_radius):
-    """What the PettingZoo environment shows in a state: (N, 3, F, F) and (N, N)."""
+def connects(positions, radius):
+    """Whether all robots reach each other over robots closer than `radius`."""
+    reached, rest = [positions[0]], list(positions[1:])
+    for here in reached:
+        near = [there for there in rest if math.dist(here, there) < radius]
+        rest = [there for there in rest if math.dist(here, there) >= radius]
+        reached += near
+    return not rest
+
+
+def seen_in_play(case, positions, config):
+    """What the PettingZoo environment shows in a state: (N, C, F, F) and (N, N)."""
     height, width = case.grid.shape
-    env = parallel_env(num_agents=3, height=height, width=width, fov_radius=radius, comm_radius=comm_radius)
+    radius = config.comm_radius
+    while config.comm_range == "connected" and not connects(case.starts.tolist(), radius):
+        radius *= 1.1
+    env = parallel_env(
+        num_agents=3,
+        height=height,
+        width=width,
+        fov_radius=config.fov_radius,
+        extra_channels=("cost_to_go",) if config.cost_to_go else (),
+        comm_radius=radius,
+        comm_weights=config.comm_weights,
+    )
     seen, _ = env.reset(seed=0, options={"instance": case.at(positions)})
     return np.stack([each["fov"] for each in seen.values()]), np.stack([each["graph"] for each in seen.values()])
 
 
+@pytest.mark.parametrize(
+    "config",
+    [
+        PERCEIVED,
+        replace(PERCEIVED, comm_range="connected"),
+        replace(PERCEIVED, comm_weights="distance"),
+        replace(PERCEIVED, cost_to_go=True, comm_range="connected", comm_weights="distance"),
+    ],
+)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_without_augmentation_a_batch_is_what_play_shows(shape):
+def test_without_augmentation_a_batch_is_what_play_shows(shape, config):
     cases, states = random_states(shape)
-    batches = BatchMaker(cases, 2, 3.0, augment=False)
-    chosen = np.array([5, 0, 39, 5])
+    batches = BatchMaker(cases, config, augment=False)
+    chosen = np.array([5, 0, 39, 5, 17])
     batch = batches.batch(states, chosen, np.random.default_rng(0))
-    assert batch.batch_size == (4,)
+    assert batch.batch_size == (5,)
+    read = []
+    policy = DecentralizedPolicy(config)
+    policy.encoder.register_forward_pre_hook(lambda module, inputs: read.append(inputs[0].clone()))
+    policy(batch[FOV], batch[GRAPH])
     for row, index in enumerate(chosen):
-        views, graph = seen_in_play(cases[states.cases[index]], states.positions[index], 2, 3.0)
-        assert np.array_equal(np.asarray(batch[FOV])[row], views)
+        views, graph = seen_in_play(cases[states.cases[index]], states.positions[index], config)
+        assert batch[FOV].dtype == torch.uint8
+        np.testing.assert_allclose(read[0].unflatten(0, (5, 3))[row], views, atol=1e-6)
         assert np.array_equal(np.asarray(batch[GRAPH])[row], graph)
         assert np.array_equal(np.asarray(batch[EXPERT_ACTION])[row], states.actions[index])
 
@@ -65,10 +105,10 @@ def test_without_augmentation_a_batch_is_what_play_shows(shape):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_augmentation_turns_views_and_labels_together_and_uses_every_symmetry(shape):
     cases, states = random_states(shape)
-    batches = BatchMaker(cases, 2, 3.0, augment=True)
+    batches = BatchMaker(cases, PERCEIVED, augment=True)
     index = 11
     batch = batches.batch(states, np.full(200, index), np.random.default_rng(0))
-    views, graph = seen_in_play(cases[states.cases[index]], states.positions[index], 2, 3.0)
+    views, graph = seen_in_play(cases[states.cases[index]], states.positions[index], PERCEIVED)
     used = set()
     for row in range(200):
         matching = [g for g in range(8) if np.array_equal(np.asarray(batch[FOV])[row], turned_by_numpy(views, g))]
@@ -87,7 +127,7 @@ def test_augmentation_turns_views_and_labels_together_and_uses_every_symmetry(sh
 
 def test_equal_generators_give_equal_batches():
     cases, states = random_states((7, 7))
-    batches = BatchMaker(cases, 2, 3.0, augment=True)
+    batches = BatchMaker(cases, PERCEIVED, augment=True)
     one, two = (batches.batch(states, np.arange(20), np.random.default_rng(5)) for _ in range(2))
     assert (one == two).all()
 

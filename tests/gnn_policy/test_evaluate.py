@@ -9,6 +9,7 @@ import torch
 
 from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, save
 from gnn_policy.config import TrainConfig
+from gnn_policy.execution import Execution
 
 CONFIG = TrainConfig(
     policy=PolicyConfig(encoder="lean", features=8, fov_radius=2),
@@ -24,7 +25,7 @@ CONFIG = TrainConfig(
 
 CHANGES = """
     --num-agents 2 5 --maps 2 --cases-per-map 3 --height 7 --width 8 --density 0.2 --styles walls --data-seed 9 --w 1.5
-    --timeout 4 --temperature 0.5 --seed 6 --threads 1
+    --timeout 4 --seed 6 --threads 1 --rows stuck,0.5 argmax,pibt,connected --failures 2
 """
 
 
@@ -36,10 +37,10 @@ def file(tmp_path):
 
 
 def examined(monkeypatch, *arguments):
-    """What the command would examine: titles to instances, and how."""
+    """What the command would examine, and how."""
     calls = []
     monkeypatch.setattr(
-        evaluate, "examine", lambda policy, instances, folder, console, **how: calls.append((instances, folder, how))
+        evaluate, "examine", lambda policy, config, folder, console, **how: calls.append((config, folder, how))
     )
     evaluate.main(list(arguments))
     return calls[0]
@@ -56,34 +57,43 @@ def test_the_help_names_every_option(capsys, monkeypatch):
 
 
 def test_what_is_not_given_is_as_in_training(file, monkeypatch):
-    instances, folder, how = examined(monkeypatch, str(file))
-    (cases,) = instances.values()
-    assert cases == evaluate.split_cases(CONFIG, "test")
-    assert (how["w"], how["timeout"], how["seed"], how["temperature"]) == (1.2, 2.0, 4, 1.0)
+    config, folder, how = examined(monkeypatch, str(file))
+    assert config == CONFIG
+    assert how["num_agents"] == ()
+    assert how["split"] == "test"
+    assert [each.name for each in how["variants"]] == ["argmax", "stuck,1", "sampled,1"]
     assert folder == file.parent / "evaluation"
 
 
-def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path):
-    instances, folder, how = examined(
-        monkeypatch,
-        str(file),
-        *CHANGES.split(),
-        *("--out", str(tmp_path / "out")),
+@pytest.mark.parametrize("split", ["test", "validation"])
+def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path, split):
+    config, folder, how = examined(
+        monkeypatch, str(file), *CHANGES.split(), "--split", split, "--out", str(tmp_path / "out")
     )
-    changed = replace(
-        CONFIG, test_maps=2, cases_per_map=3, height=7, width=8, density=0.2, styles=("walls",), data_seed=9
+    size = {"test_maps": 2, "cases_per_map": 3}
+    if split == "validation":
+        size = {"validation_maps": 2, "validation_cases_per_map": 3}
+    assert config == replace(
+        CONFIG, **size, height=7, width=8, density=0.2, styles=("walls",), data_seed=9, w=1.5, timeout=4.0, seed=6
     )
-    assert list(instances.values()) == [evaluate.split_cases(changed, "test", n) for n in (2, 5)]
-    assert how == {"w": 1.5, "timeout": 4.0, "seed": 6, "threads": 1, "temperature": 0.5}
+    assert how == {
+        "num_agents": (2, 5),
+        "variants": [Execution(sample="stuck", temperature=0.5), Execution(shield="pibt", comm_range="connected")],
+        "split": split,
+        "threads": 1,
+        "failures": 2,
+    }
     assert torch.get_num_threads() == 1
     assert folder == tmp_path / "out"
 
 
 def test_it_writes_numbers_and_an_animation(file, capsys):
-    evaluate.main([str(file), "--num-agents", "2", "3", "--threads", "1"])
+    evaluate.main([str(file), "--num-agents", "2", "3", "--threads", "1", "--failures", "2"])
     folder = file.parent / "evaluation"
-    tables = json.loads((folder / "results.json").read_text())
-    assert [title.split()[0] for title in tables] == ["2", "3"]
+    page = (folder / "failures.html").read_text(encoding="utf-8")
+    assert [page.count(f'"title":"{n} robots, case ') for n in (2, 3)] == [2, 2]
+    tables = json.loads((folder / "results.json").read_text())["num_agents"]
+    assert list(tables) == ["2", "3"]
     assert all(table["cases"] == 6 for table in tables.values())
     assert ET.parse(folder / "animation.svg").getroot().tag.endswith("svg")
     shown = capsys.readouterr().out
@@ -92,18 +102,65 @@ def test_it_writes_numbers_and_an_animation(file, capsys):
 
 
 @pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ("--styles walls", "styles"),
+        ("--rows argmax", "variants"),
+        ("--num-agents 2", "num_agents"),
+        ("--split validation --maps 3 --cases-per-map 2", "split"),
+        ("--maps 2 --seed 9", "maps, seed"),
+    ],
+)
+def test_results_of_other_settings_are_not_overwritten(file, capsys, changed, named):
+    evaluate.main([str(file), "--threads", "1"])
+    numbers = file.parent / "evaluation" / "results.json"
+    before = numbers.read_bytes()
+    evaluate.main([str(file)])
+    assert numbers.read_bytes() == before, "equal settings give equal numbers"
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        evaluate.main([str(file), *changed.split()])
+    assert end.value.code == 2
+    shown = capsys.readouterr()
+    assert shown.err == (
+        f"error: {numbers} has results of other settings ({named}): choose another folder with --out, "
+        "or delete the file\n"
+    )
+    assert "robots" not in shown.out, "it is refused before any work"
+    assert numbers.read_bytes() == before
+    evaluate.main([str(file), *changed.split(), "--out", str(file.parent / "other")])
+    assert (file.parent / "other" / "results.json").exists()
+
+
+def test_results_of_another_policy_or_another_program_are_not_overwritten(file, capsys):
+    evaluate.main([str(file), "--threads", "1"])
+    numbers = file.parent / "evaluation" / "results.json"
+    torch.manual_seed(1)
+    save(DecentralizedPolicy(CONFIG.policy), file, training=CONFIG.to_json())
+    for content, named in ((numbers.read_text(), "policy"), ("[]", "unknown"), ("{", "unknown"), ("{}", "unknown")):
+        numbers.write_text(content)
+        with pytest.raises(SystemExit):
+            evaluate.main([str(file)])
+        assert f"other settings ({named})" in capsys.readouterr().err
+        assert numbers.read_text() == content
+
+
+@pytest.mark.parametrize(
     "wrong",
     [
         "--maps 0",
         "--timeout 0",
         "--timeout -1",
-        "--temperature 0",
+        "--rows sampled,0",
+        "--rows argmax guess",
+        "--rows",
         "--w 0.9",
         "--density 0.99",
         "--num-agents 99",
         "--num-agents 0",
         "--seed -1",
         "--threads -1",
+        "--failures -1",
     ],
 )
 def test_a_mistake_takes_one_line(file, capsys, wrong):
@@ -117,8 +174,5 @@ def test_a_mistake_takes_one_line(file, capsys, wrong):
 
 def test_a_policy_without_settings_meets_the_papers_cases(tmp_path, monkeypatch):
     save(DecentralizedPolicy(CONFIG.policy), tmp_path / "policy.safetensors")
-    instances, _, how = examined(monkeypatch, str(tmp_path / "policy.safetensors"), "--maps", "1")
-    (cases,) = instances.values()
-    assert len(cases) == 50
-    assert cases[0].grid.shape == (20, 20)
-    assert how["timeout"] == 3.0
+    config, _, _ = examined(monkeypatch, str(tmp_path / "policy.safetensors"), "--maps", "1")
+    assert config == replace(TrainConfig(), test_maps=1)

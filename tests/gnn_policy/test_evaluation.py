@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from dataclasses import asdict
 from itertools import pairwise
 
 import numpy as np
@@ -12,8 +13,10 @@ from rich.console import Console
 
 import experts
 from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluation, rollout
+from gnn_policy.baselines import GreedyActor, RandomActor
 from gnn_policy.cases import make_cases
 from gnn_policy.evaluation import Estimate, Exam
+from gnn_policy.execution import Execution
 from mapf_env import Instance
 
 
@@ -73,19 +76,19 @@ def corridor(*cells):
 class Walker:
     """Goes right in every step."""
 
-    border = 1
+    border, memory = 1, 0
 
-    def act(self, cases, obstacles, positions, goals, time):
-        return np.full(positions.shape[:2], 3)
+    def act(self, teams):
+        return np.full(teams.positions.shape[:2], 3)
 
 
 class Dawdler:
     """Stays twice, then goes right."""
 
-    border = 1
+    border, memory = 1, 0
 
-    def act(self, cases, obstacles, positions, goals, time):
-        return np.full(positions.shape[:2], 4 if time < 2 else 3)
+    def act(self, teams):
+        return np.full(teams.positions.shape[:2], 4 if teams.time < 2 else 3)
 
 
 def test_flowtime_increase_by_hand():
@@ -121,6 +124,13 @@ def test_cases_that_the_expert_does_not_solve_are_counted_and_left_out():
     assert Exam.prepare(cases, w=1.0, timeout=3.0, threads=1).unsolved == 0
 
 
+VARIANTS = [
+    Execution(),
+    Execution(sample=True, temperature=2.0),
+    Execution(sample="stuck", shield="pibt", comm_range="connected", comm_weights="distance"),
+]
+
+
 @pytest.fixture(scope="module")
 def compared():
     torch.manual_seed(0)
@@ -130,19 +140,30 @@ def compared():
     )
     exam = Exam.prepare(cases, w=1.05, timeout=3.0, threads=1)
     phases = []
-    rows, played = evaluation.compare(exam, policy, seed=3, temperature=2.0, progress=phases.append)
+    rows, played = evaluation.compare(exam, policy, VARIANTS, seed=3, progress=phases.append)
     return exam, policy, rows, played, phases
 
 
-def test_the_comparison_has_a_row_for_each_competitor(compared):
+def test_the_comparison_has_a_row_for_each_variant_and_competitor(compared):
     exam, policy, rows, played, phases = compared
-    assert [row.name for row in rows] == ["policy argmax", "policy sampled", "greedy*", "PIBT*", "expert*"]
-    assert len(phases) == 4
-    again = rollout(policy, exam.instances, seed=3, max_steps=exam.max_steps)
-    assert rows[0] == evaluation.score(rows[0].name, exam, again)
-    sampled = rollout(policy, exam.instances, sample=True, temperature=2.0, seed=3, max_steps=exam.max_steps)
-    assert rows[1] == evaluation.score(rows[1].name, exam, sampled)
-    assert np.array_equal(played["sampled"].flowtime, sampled.flowtime)
+    competitors = ["random", "greedy*", "greedy,stuck*", "PIBT*", "expert*"]
+    assert [row.name for row in rows] == [each.name for each in VARIANTS] + competitors
+    assert len(phases) == len(rows) - 1
+    settings = {"seed": 3, "max_steps": exam.max_steps}
+    for variant, row, seen in zip(VARIANTS, rows, played, strict=False):
+        again = rollout(policy, exam.instances, **asdict(variant), **settings)
+        assert row == evaluation.score(variant.name, exam, again)
+        assert np.array_equal(seen.flowtime, again.flowtime)
+    actors = [RandomActor(), GreedyActor(exam.instances), GreedyActor(exam.instances, random_when_stuck=True)]
+    for actor, row in zip(actors, rows[3:6], strict=True):
+        assert row == evaluation.score(row.name, exam, rollout(actor, exam.instances, **settings))
+
+
+def test_a_policy_that_sees_the_cost_to_go_is_marked_as_one_that_knows_the_map(compared):
+    exam = compared[0]
+    policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2, cost_to_go=True))
+    rows, _ = evaluation.compare(exam, policy, VARIANTS[:1])
+    assert rows[0].name == "argmax,cost-to-go*"
 
 
 def test_pibt_is_measured_like_everybody(compared):
@@ -153,13 +174,13 @@ def test_pibt_is_measured_like_everybody(compared):
         solved += result.solved
         flowtime = result.solution.sum_of_costs if result.solution else limit * case.num_agents
         increases.append(flowtime / base - 1)
-    assert rows[3].success_rate.mean == solved / len(exam.instances)
-    assert rows[3].flowtime_increase.mean == pytest.approx(np.mean(increases))
+    assert rows[6].success_rate.mean == solved / len(exam.instances)
+    assert rows[6].flowtime_increase.mean == pytest.approx(np.mean(increases))
 
 
 def test_the_expert_is_its_own_measure(compared):
     exam, _, rows, _, _ = compared
-    expert = rows[4]
+    expert = rows[7]
     assert (expert.success_rate.mean, expert.flowtime_increase.mean, expert.latched) == (1.0, 0.0, 1.0)
     assert expert.makespan.mean == pytest.approx(np.mean([each.makespan for each in exam.solutions]))
     assert all(base >= bound for base, bound in zip(exam.flowtimes, exam.lower_bounds, strict=True))
@@ -184,7 +205,7 @@ def test_the_table_shows_every_figure_within_eighty_columns(compared):
     text = shown.getvalue()
     assert "…" not in text
     for row in rows:
-        assert row.name in text
+        assert row.name in text or row.name == VARIANTS[2].name
         assert f"{row.success_rate.mean:.3f}" in text
         assert f"[{row.success_rate.low:.3f}, {row.success_rate.high:.3f}]" in text
         assert f"{row.flowtime_increase.mean:+.1%}" in text

@@ -170,11 +170,14 @@ def test_shapes_that_do_not_fit_are_refused():
         ({"features": 0}, "features"),
         ({"fov_radius": 1}, "fov_radius"),
         ({"comm_radius": -1.0}, "comm_radius"),
+        ({"comm_radius": 0.0, "comm_range": "connected"}, "comm_radius must be positive to grow"),
+        ({"comm_range": "wide"}, "comm_range"),
+        ({"comm_weights": "heavy"}, "comm_weights"),
         ({"comm_radius": float("nan")}, "comm_radius"),
     ],
 )
 def test_bad_settings_are_refused_by_name(wrong, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, jaxtyping.TypeCheckError), match=message):
         PolicyConfig(**wrong)
 
 

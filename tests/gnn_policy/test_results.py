@@ -9,7 +9,8 @@ import torch
 from rich.console import Console
 
 from gnn_policy import DecentralizedPolicy, PolicyConfig, results
-from gnn_policy.cases import make_cases
+from gnn_policy.checkpoint import fingerprint
+from gnn_policy.config import TrainConfig
 from gnn_policy.rollout import Rollouts
 from mapf_env import Instance, Solution
 
@@ -34,11 +35,10 @@ def test_the_animation_shows_the_solved_case_of_median_length():
 def test_the_numbers_are_written_last(tmp_path, monkeypatch):
     torch.manual_seed(0)
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))
-    cases = make_cases(
-        "test", seed=0, maps=2, cases_per_map=2, num_agents=2, height=5, width=5, density=0.0, styles=["cells"]
+    config = TrainConfig(
+        policy=policy.config, num_agents=2, height=5, width=5, density=0.0, test_maps=2, cases_per_map=2, w=1.1
     )
     console = Console(file=io.StringIO(), width=80)
-    how = {"w": 1.1, "timeout": 3.0, "seed": 0, "threads": 1}
 
     def crash(*_, **__):
         raise RuntimeError("crash")
@@ -46,9 +46,30 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(results, "animate", crash)
         with pytest.raises(RuntimeError, match="crash"):
-            results.examine(policy, {"cases": cases}, tmp_path, console, **how)
+            results.examine(policy, config, tmp_path, console, threads=1)
     assert list(tmp_path.iterdir()) == [], "a run with results.json counts as finished"
-    results.examine(policy, {"cases": cases}, tmp_path, console, **how)
-    table = json.loads((tmp_path / "results.json").read_text())["cases"]
-    assert table["cases"] == 4
-    assert len(table["rows"]) == 5
+    results.examine(policy, config, tmp_path, console, threads=1)
+    numbers = json.loads((tmp_path / "results.json").read_text())
+    assert numbers["num_agents"]["2"]["cases"] == 4
+    assert [row["name"] for row in numbers["num_agents"]["2"]["rows"]][:4] == [
+        "argmax",
+        "stuck,1",
+        "sampled,1",
+        "random",
+    ]
+    assert numbers["settings"] == {
+        "policy": fingerprint(policy),
+        "variants": ["argmax", "stuck,1", "sampled,1"],
+        "num_agents": [2],
+        "split": "test",
+        "maps": 2,
+        "cases_per_map": 2,
+        "height": 5,
+        "width": 5,
+        "density": 0.0,
+        "styles": ["cells"],
+        "data_seed": 0,
+        "w": 1.1,
+        "timeout": 3.0,
+        "seed": 0,
+    }

@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 
 import experts
 from gnn_policy import DecentralizedPolicy, PolicyConfig, rollout
+from gnn_policy.baselines import RandomActor
 from gnn_policy.cases import make_cases
-from gnn_policy.rollout import GreedyActor, PolicyActor, uniform
+from gnn_policy.execution import Execution
+from gnn_policy.rollout import PolicyActor, Teams
 from mapf_env import BatchedEnv, Instance, parallel_env
 
 few = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -45,31 +47,31 @@ def policy():
     return policy.eval()
 
 
-class RandomActor:
-    border = 1
+class ErraticActor:
+    border, memory = 1, 0
 
     """Moves at random, crowding included."""
 
     def __init__(self, seed):
         self.generator = np.random.default_rng(seed)
 
-    def act(self, cases, obstacles, positions, goals, time):
-        return self.generator.integers(5, size=positions.shape[:2])
+    def act(self, teams):
+        return self.generator.integers(5, size=teams.positions.shape[:2])
 
 
 class ScriptedActor:
-    border = 1
+    border, memory = 1, 0
 
     """Follows given paths, then stays."""
 
     def __init__(self, paths):
         self.paths = paths
 
-    def act(self, cases, obstacles, positions, goals, time):
-        moves = np.full(positions.shape[:2], 4)
-        for team, case in enumerate(cases):
+    def act(self, teams):
+        moves, time = np.full(teams.positions.shape[:2], 4), teams.time
+        for team, case in enumerate(teams.cases):
             path = self.paths[case]
-            assert np.array_equal(positions[team], path[min(time, len(path) - 1)]), "the team has left its path"
+            assert np.array_equal(teams.positions[team], path[min(time, len(path) - 1)]), "the team has left its path"
             if time + 1 < len(path):
                 for robot, (before, after) in enumerate(zip(path[time], path[time + 1], strict=True)):
                     moves[team, robot] = STEPS.index(tuple((after - before).tolist()))
@@ -132,12 +134,15 @@ def assert_judged_rightly(played, limits):
 def test_nothing_executed_collides_and_the_judgement_is_right(seed, num_agents):
     crowd = random_cases(seed, maps=3, num_agents=num_agents, height=3, width=4, density=0.1)
     limits = np.random.default_rng(seed).integers(1, 60, len(crowd))
-    played = rollout(RandomActor(seed), crowd, seed=seed, max_steps=limits)
+    played = rollout(ErraticActor(seed), crowd, seed=seed, max_steps=limits)
     assert played.instances == crowd
     assert_judged_rightly(played, limits)
 
 
-@pytest.mark.parametrize("sample", [False, True])
+SAMPLES = [False, True, "stuck"]
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
 def test_the_policy_is_judged_like_anyone(cases, policy, sample):
     played = rollout(policy, cases, sample=sample, max_steps=30, seed=2)
     assert_judged_rightly(played, [30] * len(cases))
@@ -153,29 +158,88 @@ def same(one, two, i, j):
     )
 
 
-@pytest.mark.parametrize("sample", [False, True])
+@pytest.mark.parametrize("sample", SAMPLES)
 def test_the_size_of_batches_does_not_matter(cases, policy, sample):
     played = [rollout(policy, cases, sample=sample, max_steps=25, batch_size=size) for size in (1, 3, 5, 256)]
     for other in played[1:]:
         assert all(same(played[0], other, i, i) for i in range(len(cases)))
 
 
-@pytest.mark.parametrize("sample", [False, True])
-def test_a_case_does_not_depend_on_its_neighbours(cases, policy, sample):
-    """Whatever the others are: a draw depends on the seed, the case's number, the time and the robot alone."""
-    others = random_cases(seed=9)
-    mixed = [case if i % 3 == 0 else others[i] for i, case in enumerate(cases)]
-    one, two = (rollout(policy, each, sample=sample, max_steps=25, seed=4) for each in (cases, mixed))
-    assert all(same(one, two, i, i) for i in range(0, len(cases), 3))
+@few
+@given(
+    seed=st.integers(0, 2**64 - 1),
+    order=st.permutations(range(12)),
+    kept=st.integers(1, 12),
+    sample=st.sampled_from(SAMPLES),
+    shield=st.sampled_from(["idle", "pibt"]),
+    comm_range=st.sampled_from(["fixed", "connected"]),
+)
+def test_a_case_depends_neither_on_its_place_nor_on_the_others(
+    cases, policy, seed, order, kept, sample, shield, comm_range
+):
+    settings = {"sample": sample, "shield": shield, "comm_range": comm_range, "max_steps": 12}
+    whole = rollout(policy, cases, seed=seed, **settings)
+    chosen = order[:kept]
+    part = rollout(policy, [cases[i] for i in chosen], seed=seed, batch_size=5, **settings)
+    assert all(same(whole, part, i, place) for place, i in enumerate(chosen))
+
+
+def test_equal_cases_end_equally_unless_their_seeds_differ(cases, policy):
+    copies = [cases[0]] * 6
+    equal = rollout(policy, copies, sample=True, max_steps=25, seed=3)
+    assert all(same(equal, equal, 0, i) for i in range(6))
+    seeds = [3, 4, 5, 3, 4, 5]
+    own = rollout(policy, copies, sample=True, max_steps=25, seed=seeds)
+    for i, seed in enumerate(seeds):
+        assert same(own, rollout(policy, copies[:1], sample=True, max_steps=25, seed=seed), i, 0)
+    assert len({own.solutions[i].paths.tobytes() for i in range(6)}) == 3
+
+
+def test_goals_and_maps_are_part_of_what_draws_depend_on(policy):
+    """The noise of cases that differ in anything is independent."""
+    grid = np.zeros((4, 4), bool)
+    walled = grid.copy()
+    walled[3, 3] = True
+    alike = [
+        Instance(grid, [[0, 0], [1, 1]], [[2, 2], [0, 1]]),
+        Instance(grid, [[0, 0], [1, 1]], [[2, 1], [0, 1]]),
+        Instance(grid, [[0, 0], [1, 2]], [[2, 2], [0, 1]]),
+        Instance(walled, [[0, 0], [1, 1]], [[2, 2], [0, 1]]),
+    ]
+    seen = []
+
+    class Listening(RandomActor):
+        def act(self, teams):
+            seen.append(teams.seeds)
+            return super().act(teams)
+
+    rollout(Listening(), alike, max_steps=1)
+    assert len(set(seen[0].tolist())) == 4
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_the_policy_is_left_in_the_mode_that_it_was_in(cases, policy, training):
+    policy.train(training)
+    try:
+        played = rollout(policy, cases, max_steps=5)
+        assert policy.training == training
+        assert all(module.training == training for module in policy.modules())
+        with pytest.raises(ValueError, match="max_steps"):
+            rollout(policy, cases, max_steps=0)
+        assert policy.training == training
+    finally:
+        policy.eval()
+    assert all(same(played, rollout(policy, cases, max_steps=5), i, i) for i in range(len(cases)))
 
 
 class CrowdingActor:
-    border = 1
+    border, memory = 1, 0
 
     """Random moves that depend on the case and the time alone, so that the shield has ties to break."""
 
-    def act(self, cases, obstacles, positions, goals, time):
-        return np.stack([np.random.default_rng([case, time]).integers(5, size=positions.shape[1]) for case in cases])
+    def act(self, teams):
+        robots = teams.positions.shape[1]
+        return np.stack([np.random.default_rng([case, teams.time]).integers(5, size=robots) for case in teams.cases])
 
 
 def test_neither_batches_nor_neighbours_that_end_early_change_how_ties_are_broken_or_when_time_is_up():
@@ -197,18 +261,6 @@ def test_equal_seeds_repeat_and_others_do_not(cases, policy):
     assert not all(same(one, three, i, i) for i in range(len(cases)))
 
 
-def test_draws_are_uniform_and_depend_on_each_argument():
-    draws = uniform(3, np.arange(500), 7, 20)
-    assert draws.shape == (500, 20)
-    assert ((draws >= 0) & (draws < 1)).all()
-    counts, _ = np.histogram(draws, 10, (0, 1))
-    assert abs(counts - 1000).max() < 150
-    assert np.array_equal(uniform(3, np.array([17]), 7, 20)[0], draws[17])
-    for other in (uniform(4, np.arange(500), 7, 20), uniform(3, np.arange(500), 8, 20)):
-        assert not (other == draws).any()
-    assert len(np.unique(draws)) == draws.size
-
-
 def observed(case, config):
     height, width = case.grid.shape
     env = parallel_env(
@@ -228,48 +280,72 @@ def test_sampled_moves_follow_the_tempered_softmax_and_argmax_its_mode(cases, po
         logits = policy(*observed(case, policy.config))[0]
     pad = policy.config.fov_radius
     obstacles = np.pad(case.grid.astype(np.float32), pad, constant_values=1)
-    shown = [np.repeat(each[None], 3000, 0) for each in (obstacles, case.starts, case.goals)]
+    maps, starts, goals = (np.repeat(each[None], 3000, 0) for each in (obstacles, case.starts, case.goals))
+    past = np.empty((0, *starts.shape), np.int32)
+    teams = Teams(np.zeros(3000, np.intp), np.arange(3000, dtype=np.uint64), maps, starts, goals, past, time=0)
     for temperature in (0.3, 1.0, 4.0):
-        actor = PolicyActor(policy, sample=True, temperature=temperature, seed=1)
-        moves = actor.act(np.arange(3000), *shown, time=0)
+        actor = PolicyActor(policy, [case], Execution(sample=True, temperature=temperature))
+        moves = actor.act(teams).argmax(-1)
         counted = np.stack([(moves == action).mean(axis=0) for action in range(5)], -1)
         np.testing.assert_allclose(counted, torch.softmax(logits / temperature, -1).numpy(), atol=0.04)
-    assert np.array_equal(PolicyActor(policy).act(np.arange(3000), *shown, time=0)[0], logits.argmax(-1).numpy())
+    assert np.array_equal(PolicyActor(policy, [case], Execution()).act(teams)[0].argmax(-1), logits.argmax(-1).numpy())
 
 
-def bfs(grid, goal):
-    distance, queue = {goal: 0}, [goal]
-    for here in queue:
-        for down, right in STEPS[:4]:
-            there = here[0] + down, here[1] + right
-            inside = 0 <= there[0] < grid.shape[0] and 0 <= there[1] < grid.shape[1]
-            if inside and not grid[there] and there not in distance:
-                distance[there] = distance[here] + 1
-                queue.append(there)
-    return distance
+def reached(stuck, graph):
+    return [bool(stuck[i] or any(stuck[j] for j in range(len(stuck)) if graph[i][j] > 0)) for i in range(len(stuck))]
 
 
-def test_a_greedy_robot_alone_follows_a_shortest_path():
-    alone = random_cases(num_agents=1, maps=15, density=0.3)
-    played = rollout(GreedyActor(alone), alone, max_steps=100)
-    for i, case in enumerate(alone):
-        shortest = bfs(case.grid, tuple(case.goals[0].tolist()))[tuple(case.starts[0].tolist())]
-        assert played.success[i]
-        assert played.flowtime[i] == played.makespan[i] == shortest
-        assert played.replaced[i] == 0
+@pytest.mark.parametrize("taps", [1, 3])
+def test_sampling_when_stuck_differs_from_argmax_only_for_robots_that_know_of_a_stuck_one(cases, taps):
+    torch.manual_seed(1)
+    config = PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=2.5, taps=taps)
+    policy = DecentralizedPolicy(config).eval()
+    generator = np.random.default_rng(0)
+    drew = stayed = told = 0
+    for case in cases:
+        came_back = np.array([case.goals, case.starts[[0, 2, 1, 3]]])[:, None]
+        for positions, past in ((case.starts, came_back), (case.goals, came_back), (case.starts, came_back[:1])):
+            obstacles = np.pad(case.grid.astype(np.float32), 2, constant_values=1)[None]
+            stuck = [
+                any(np.array_equal(then, here) for then in past[:, 0, i]) and not np.array_equal(here, case.goals[i])
+                for i, here in enumerate(positions)
+            ]
+            distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+            graph = (distances < 2.5) & (distances > 0)
+            draws = reached(stuck, graph) if taps > 1 else stuck
+            seeds = generator.integers(2**63, size=1, dtype=np.uint64)
+            teams = Teams(np.zeros(1, np.intp), seeds, obstacles, positions[None], case.goals[None], past, 5)
+            always, never, when_stuck = (
+                PolicyActor(policy, [case], Execution(sample=sample)).act(teams)[0] for sample in (True, False, "stuck")
+            )
+            for i, draw in enumerate(draws):
+                assert np.array_equal(when_stuck[i], (always if draw else never)[i])
+                assert not np.array_equal(always[i], never[i])
+            drew, stayed = drew + sum(draws), stayed + draws.count(False)
+            told += sum(draws) - sum(stuck)
+    assert drew
+    assert stayed
+    assert (told > 0) == (taps > 1)
 
 
-def test_every_greedy_move_approaches_the_goal_and_robots_on_goals_stay():
-    crowd = random_cases(num_agents=6, maps=10, density=0.2)
-    actor = GreedyActor(crowd)
-    for i, case in enumerate(crowd):
-        for positions in (case.starts, case.goals):
-            moves = actor.act(np.array([i]), np.empty(0), positions[None], case.goals[None], 0)[0]
-            for robot, move in enumerate(moves):
-                distance = bfs(case.grid, tuple(case.goals[robot].tolist()))
-                here = tuple(positions[robot].tolist())
-                there = here[0] + STEPS[move][0], here[1] + STEPS[move][1]
-                assert distance[there] == max(distance[here] - 1, 0)
+def test_the_memory_of_a_team_is_its_last_positions(cases):
+    class Remembering(RandomActor):
+        memory = 3
+
+        def __init__(self):
+            self.seen = []
+
+        def act(self, teams):
+            self.seen.append((teams.cases, teams.past))
+            return super().act(teams)
+
+    actor = Remembering()
+    played = rollout(actor, cases, max_steps=np.arange(len(cases)) + 2)
+    for time, (active, past) in enumerate(actor.seen):
+        assert len(past) == min(time, 3)
+        for team, case in enumerate(active):
+            expected = played.solutions[case].paths[max(time - 3, 0) : time]
+            assert np.array_equal(past[:, team], expected)
 
 
 def test_every_plan_of_the_expert_replays_exactly():
@@ -320,9 +396,9 @@ def test_the_share_of_replaced_actions():
     face_to_face = Instance(grid, [[0, 1], [0, 2], [0, 4]], [[0, 2], [0, 1], [0, 3]])
 
     class Pushing:
-        border = 1
+        border, memory = 1, 0
 
-        def act(self, cases, obstacles, positions, goals, time):
+        def act(self, teams):
             return np.array([[3, 1, 4]])
 
     played = rollout(Pushing(), [face_to_face], max_steps=6)
@@ -369,7 +445,7 @@ def test_instances_of_different_sizes_are_refused(cases, policy):
         rollout(policy, [*cases, *random_cases(num_agents=2)])
 
 
-@pytest.mark.parametrize("sample", [False, True])
+@pytest.mark.parametrize("sample", SAMPLES)
 def test_under_the_pibt_shield_nothing_collides_and_batches_do_not_matter(cases, policy, sample):
     settings = {"shield": "pibt", "sample": sample, "max_steps": 25, "seed": 3}
     out = rollout(policy, cases, **settings)
@@ -378,9 +454,3 @@ def test_under_the_pibt_shield_nothing_collides_and_batches_do_not_matter(cases,
         assert_legal(instance, solution.paths)
         assert np.array_equal(solution.paths, twin.paths)
     assert np.array_equal(out.replaced, again.replaced)
-
-
-def test_a_greedy_team_under_the_pibt_shield_arrives_more_often(cases):
-    many = random_cases(seed=1, maps=20, num_agents=8)
-    idle, pibt = (rollout(GreedyActor(many), many, shield=shield, max_steps=60) for shield in ("idle", "pibt"))
-    assert pibt.success.mean() > idle.success.mean()

@@ -372,11 +372,12 @@ def arguments_for(config, folder):
         for option, setting in (
             [(f"policy.{each}", v) for each, v in value.items()] if name == "policy" else [(name, value)]
         ):
-            flag = "--" + option.replace("_", "-")
+            *group, last = option.replace("_", "-").split(".")
             if isinstance(setting, bool):
-                flags.append(flag if setting else f"--no-{option.replace('_', '-')}")
+                flags.append("--" + ".".join([*group, last if setting else f"no-{last}"]))
             else:
-                flags += [flag, *map(str, setting if isinstance(setting, tuple) else (setting,))]
+                flags.append("--" + ".".join([*group, last]))
+                flags += map(str, setting if isinstance(setting, tuple) else (setting,))
     return flags
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import oracles
 import strategies
-from mapf_env import Instance, random_cases, random_instance, random_map, random_maps
+from mapf_env import Instance, Maze, Rooms, Warehouse, random_cases, random_instance, random_map, random_maps
 from mapf_env.generation import MapStyle
 
 Style = Literal["cells", "walls"]
@@ -163,7 +163,7 @@ def test_global_random_state_is_neither_read_nor_written() -> None:
         ({"density": float("nan")}, r"density must lie in \[0, 1\)"),
         ({"height": 0}, "height=0"),
         ({"width": -3}, "width=-3"),
-        ({"style": "cave"}, "style must be one of cells, walls, maze, room, warehouse, empty, got 'cave'"),
+        ({"style": "cave"}, "style must be one of cells, .*, empty, or a Maze, Rooms or Warehouse, got 'cave'"),
         ({"num_agents": 0}, "num_agents must be at least 1, got 0"),
         ({"seed": -1}, "seed must .*-1"),
         ({"seed": 2**64}, "seed must .*18446744073709551616"),
@@ -214,3 +214,78 @@ def test_the_other_styles_look_as_they_are_called() -> None:
     assert not warehouse[::3].any()
     for style in ("maze", "room"):
         assert (random_map(style=style, seed=1) != random_map(style=style, seed=2)).any()  # pyright: ignore[reportArgumentType]
+
+
+parts = st.one_of(
+    st.builds(Maze, corridor_width=st.integers(1, 5), loops=st.sampled_from([0.0, 0.1, 1.0])),
+    st.builds(Rooms, room_size=st.integers(1, 8)),
+    st.builds(
+        Warehouse, shelf_length=st.integers(1, 7), shelf_depth=st.integers(1, 4), corridor_width=st.integers(1, 4)
+    ),
+)
+
+
+@given(st.integers(1, 25), st.integers(1, 25), strategies.seeds, parts)
+def test_parts_of_any_size_leave_the_map_connected(
+    height: int, width: int, seed: int, style: Maze | Rooms | Warehouse
+) -> None:
+    grid = random_map(height=height, width=width, style=style, seed=seed)
+    assert len(oracles.regions(grid)) == 1
+
+
+@given(strategies.seeds, st.integers(1, 4), st.integers(2, 5), st.integers(2, 5))
+def test_a_maze_without_loops_is_a_tree_of_corridors(seed: int, corridor: int, rows: int, cols: int) -> None:
+    period = corridor + 1
+    height, width = rows * period - 1, cols * period - 1
+    grid = random_map(height=height, width=width, style=Maze(corridor_width=corridor, loops=0.0), seed=seed)
+    nodes, links = {(row, col) for row in range(rows) for col in range(cols)}, 0
+    for row, col in nodes:
+        top, left = row * period, col * period
+        assert not grid[top : top + corridor, left : left + corridor].any()
+        right, below = grid[top : top + corridor, left + corridor :], grid[top + corridor :, left : left + corridor]
+        for wall in (right[:, :1], below[:1]):
+            assert wall.all() or not wall.any(), "a passage is as wide as a corridor"
+        links += col + 1 < cols and not grid[top, left + corridor]
+        links += row + 1 < rows and not grid[top + corridor, left]
+    assert links == len(nodes) - 1
+    open_maze = random_map(height=height, width=width, style=Maze(corridor_width=corridor, loops=1.0), seed=seed)
+    pillars = np.zeros((height, width), bool)
+    pillars[corridor::period, corridor::period] = True
+    assert (open_maze == pillars).all(), "all walls are opened"
+
+
+def test_parts_have_the_sizes_that_were_asked_for() -> None:
+    rooms = random_map(height=11, width=15, style=Rooms(room_size=3), seed=0)
+    inner = np.zeros((11, 15), bool)
+    inner[3::4], inner[:, 3::4] = True, True
+    assert not rooms[~inner].any()
+    assert rooms[inner].sum() == inner.sum() - (2 * 4 + 3 * 3), "a door in each wall between two rooms"
+    shelves = random_map(height=14, width=24, style=Warehouse(shelf_length=4, shelf_depth=3, corridor_width=2))
+    drawn = np.zeros((14, 24), bool)
+    for top in (2, 7):
+        for left in (4, 10, 16):
+            drawn[top : top + 3, left : left + 4] = True
+    assert (shelves == drawn).all()
+
+
+def test_names_of_styles_stand_for_the_usual_parts() -> None:
+    for name, style in (("maze", Maze()), ("room", Rooms()), ("warehouse", Warehouse())):
+        assert (random_map(style=name, seed=4) == random_map(style=style, seed=4)).all()  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "error", "message"),
+    [
+        (Maze, {"corridor_width": 0}, ValueError, r"the corridor_width of Maze must lie in 1\.\.9999, got 0"),
+        (Maze, {"loops": 1.5}, ValueError, r"the loops of a Maze must lie in \[0, 1\], got 1.5"),
+        (Maze, {"loops": float("nan")}, ValueError, "the loops of a Maze must lie"),
+        (Rooms, {"room_size": 10**10}, ValueError, "the room_size of Rooms must lie"),
+        (Rooms, {"room_size": 2.5}, TypeError, "the room_size of Rooms must be an integer, got 2.5"),
+        (Warehouse, {"shelf_depth": -1}, ValueError, "the shelf_depth of Warehouse must lie"),
+    ],
+)
+def test_parts_out_of_range_are_refused(
+    kind: Any, settings: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        kind(**settings)

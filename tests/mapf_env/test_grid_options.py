@@ -115,3 +115,16 @@ def test_rendering(capsys: pytest.CaptureFixture[str]) -> None:
         parallel_env(render_mode="hologram")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="observation must be dict or box"):
         parallel_env(observation="smell")  # pyright: ignore[reportArgumentType]
+
+
+def test_in_a_terminal_each_state_takes_the_place_of_the_one_before(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr("time.sleep", waits.append)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    env = parallel_env(num_agents=2, height=2, width=3, density=0, render_mode="human")
+    env.reset(options={"instance": parse_instance("AB#\n.ba")})
+    env.step({"agent_0": 4, "agent_1": 2})
+    assert capsys.readouterr().out == "AB#\n.ba\n\x1b[2F\x1b[JA.#\n.*a\n"
+    assert waits == [0.25]

@@ -129,6 +129,15 @@ def test_copies_made_mid_episode_go_on_identically(duplicate: Any) -> None:
     assert_same(play(env, None, 3), play(twin, None, 3))
 
 
+def test_copies_of_an_environment_not_yet_begun_play_episodes_of_their_own() -> None:
+    """Wrappers make vector environments of pickled copies, and nobody wants the same team sixteen times."""
+    env = parallel_env(**SMALL)
+    copies = [pickle.loads(pickle.dumps(env)) for _ in range(5)] + [copy.deepcopy(env)]
+    for each in copies:
+        each.reset()
+    assert len({str((each.grid, each.positions, each.goals)) for each in copies}) == len(copies)
+
+
 def test_observations_lie_in_their_spaces_and_belong_to_the_caller() -> None:
     env = parallel_env(**SMALL)
     observations, infos = env.reset(seed=0)

@@ -164,7 +164,7 @@ def test_damaged_maps(tmp_path, text, message):
     [
         ("", "line 1: expected 'version 1', got the end of the file; is this a MovingAI scenario"),
         (SCEN.replace("version 1", "version 2"), "line 1: expected 'version 1', got 'version 2'"),
-        ("version 1\n", "the scenario has no entries"),
+        ("version 1\n", "line 1: no entries follow"),
         (SCEN.replace("\t2.41421356\n1", "\n1"), "line 2: expected 9 fields separated by tabs"),
         (SCEN.replace("version 1\n", "version 1\n\n"), "line 2: expected 9 fields"),
         (SCEN[:60], "line 3: expected 9 fields"),
@@ -218,7 +218,7 @@ def test_a_missing_map_says_where_it_was_expected(files, tmp_path):
     scen = files()
     (tmp_path / "a.map").unlink()
     with pytest.raises(
-        FileNotFoundError, match=r"a\.scen names the map 'a\.map', which is not beside it: put it there or"
+        FileNotFoundError, match=r"a\.scen, line 2 names the map 'a\.map', which is not beside it: put it there or"
     ):
         load_scen(scen)
 

@@ -1,7 +1,8 @@
 """Laws of what goes beyond the paper: each option against its definition, and all of them at once against the rules."""
 
 import math
-from itertools import pairwise
+from collections.abc import Sequence
+from itertools import pairwise, permutations, product
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,65 @@ def test_pibt_never_collides_and_the_first_gets_what_it_wants(
         assert executed[first] == wanted[0, first], "nobody is more important, and the cell is empty"
 
 
+@given(strategies.crowds(max_side=6), st.data())
+@hypothesis_settings(max_examples=300)
+def test_pibt_is_the_algorithm_of_its_paper(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject
+) -> None:
+    """Priorities and preferences without ties leave nothing to the lot, so the whole joint action is known."""
+    grid, team = crowd
+    under_way = data.draw(st.permutations(range(len(team))))
+    wishes = [data.draw(st.permutations(range(5))) for _ in team]
+    values = np.array([[[-wish.index(action) for action in range(5)] for wish in wishes]], np.float32)
+    order = sorted(range(len(team)), key=lambda robot: -under_way[robot])
+    expected = oracles.pibt(grid, team, order, wishes)
+    assert pibt_alone(grid, team, values, under_way, seed=data.draw(strategies.seeds)) == expected
+
+
+@given(strategies.crowds(max_side=4, max_agents=3), st.data(), strategies.seeds)
+@hypothesis_settings(max_examples=50)
+def test_what_pibt_draws_by_lot_are_equal_priorities_and_the_last_of_the_preferences(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, seed: int
+) -> None:
+    grid, team = crowd
+    robots = range(len(team))
+    wanted = data.draw(strategies.joint_actions(len(team)))
+    under_way = [data.draw(st.integers(0, 1)) for _ in team]
+    orders = [each for each in permutations(robots) if all(under_way[a] >= under_way[b] for a, b in pairwise(each))]
+    heads = [[action] if action == oracles.IDLE else [action, oracles.IDLE] for action in wanted]
+    wishes = [[(*head, *tail) for tail in permutations(set(range(5)) - set(head))] for head in heads]
+    possible = [oracles.pibt(grid, team, order, joint) for order in orders for joint in product(*wishes)]
+    assert pibt_alone(grid, team, np.array([wanted]), under_way, seed) in possible
+
+
+def test_pibts_lots_are_fair_and_its_priorities_keep_for_an_episode() -> None:
+    open_field, centre = np.zeros((3, 3), bool), [(1, 0), (1, 1)]
+    pushed = [pibt_alone(open_field, centre, np.array([[3, 4]]), [5, 0], seed=0, time=time)[1] for time in range(900)]
+    assert {oracles.UP, oracles.DOWN, oracles.RIGHT} == set(pushed), "back would be a swap"
+    assert all(240 < pushed.count(action) < 360 for action in set(pushed))  # 300 expected, standard deviation 14
+    corridor, apart = np.zeros((1, 3), bool), [(0, 0), (0, 2)]
+
+    def winner(seed: int, time: int) -> int:
+        return pibt_alone(corridor, apart, np.array([[3, 1]]), [0, 0], seed, time).index(oracles.IDLE)
+
+    assert 400 < sum(winner(seed, 0) for seed in range(1000)) < 600
+    assert len({winner(7, time) for time in range(20)}) == 1
+
+
+def pibt_alone(
+    grid: oracles.Grid,
+    team: list[oracles.Cell],
+    wanted: npt.NDArray[Any],
+    under_way: Sequence[int],
+    seed: int,
+    time: int = 0,
+) -> list[int]:
+    """What the PIBT shield executes for one team."""
+    maps, positions = rules.bordered(grid[None], 2), np.array([team], np.int32)
+    waits, seeds, times = np.array([under_way], np.int32), np.array([seed], np.uint64), np.array([time])
+    return rules.pibt_shield(maps, 2, positions, wanted, waits, seeds, times)[0].tolist()
+
+
 @given(strategies.crowds(max_side=5), st.data(), strategies.seeds)
 def test_pibt_lets_harmless_joint_actions_pass(
     crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, seed: int
@@ -226,6 +286,63 @@ def test_lifelong_goals_are_reachable_distinct_and_uniform() -> None:
     assert counts.min() > 0.5 * counts.mean()
 
 
+def test_lifelong_goals_stay_in_the_region_of_their_robot() -> None:
+    parted = Instance([[0, 0, 0, 1, 0, 0, 0]], [[0, 0], [0, 4]], [[0, 1], [0, 5]])
+    env = BatchedEnv(1, num_agents=2, height=1, width=7, density=0.0, task="lifelong", max_cycles=10**6)
+    env.reset(seed=0, instances=[parted])
+    generator, arrivals = np.random.default_rng(0), 0
+    for _ in range(300):
+        arrivals += int(env.step(generator.choice([1, 3], (1, 2))).arrived.sum())
+        assert (env.goals[0, :, 1] // 4 == [0, 1]).all()
+    assert arrivals > 20
+
+
+@given(strategies.crowds(max_side=5), st.data(), strategies.seeds)
+def test_new_goals_are_as_defined(
+    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, seed: int
+) -> None:
+    """They are reachable, nobody's goal and not where the robot stands; without such a cell the goal stays."""
+    grid, team = crowd
+    arrived = np.array([data.draw(st.lists(st.booleans(), min_size=len(team), max_size=len(team)))])
+    goals = [data.draw(st.permutations(sorted(oracles.free_cells(grid))))[: len(team)]]
+    maps, positions = rules.bordered(grid[None], 1), np.array([team], np.int32)
+    counts, seeds = np.ones((1, len(team)), np.int32), np.array([seed], np.uint64)
+    drawn = rules.draw_goals(maps, 1, positions, np.array(goals, np.int32), arrived, counts, seeds)
+    left = list(goals[0])
+    for robot, new in enumerate(oracles.cells(drawn[0])):
+        possible = set(oracles.distances(grid, team[robot])) - set(left) - {team[robot]}
+        if arrived[0, robot] and possible:
+            assert new in possible
+        else:
+            assert new == left[robot]
+        left[robot] = new
+
+
+def test_new_goals_are_uniform_where_most_cells_are_blocked() -> None:
+    draws, grid = 4000, np.array([[0] * 8, [1] * 7 + [0]], bool)
+    maps = rules.bordered(np.broadcast_to(grid, (draws, 2, 8)), 1)
+    start = np.zeros((draws, 1, 2), np.int32)
+    arrived, counts = np.ones((draws, 1), np.bool_), np.ones((draws, 1), np.int32)
+    drawn = rules.draw_goals(maps, 1, start, start, arrived, counts, np.arange(draws).astype(np.uint64))
+    hits = np.zeros((2, 8), int)
+    np.add.at(hits, tuple(drawn[:, 0].T), 1)
+    assert hits[0, 0] == hits[grid].sum() == 0
+    assert all(400 < hit < 600 for hit in hits[hits > 0])  # 500 expected, standard deviation 21
+
+
+def test_edges_of_a_batch_are_those_of_its_teams() -> None:
+    env = BatchedEnv(3, num_agents=7, height=8, width=8, comm_weights="distance", message_loss=0.3)
+    graph = env.reset(seed=2).graph
+    edges, expected = env.edges(graph), []
+    for b in range(3):
+        for i in range(7):
+            for j in range(7):
+                if graph[b, i, j]:
+                    expected.append((b, i, j, graph[b, i, j], *(env.positions[b, j] - env.positions[b, i]).tolist()))
+    assert [(*row[:4], *row[4].tolist()) for row in zip(*edges, strict=True)] == expected
+    assert len({row[0] for row in expected}) == 3
+
+
 def test_a_lifelong_robot_without_a_free_cell_keeps_its_goal() -> None:
     full = Instance(np.zeros((1, 2), bool), [[0, 0], [0, 1]], [[0, 1], [0, 0]])
     env = BatchedEnv(1, num_agents=2, height=1, width=2, density=0.0, task="lifelong")
@@ -270,16 +387,16 @@ def test_autoreset_plays_the_episodes_that_a_manual_reset_plays(mode: AutoresetM
                 assert not ended[b]
                 continue
             expected = single.step(actions[b : b + 1])
-            for one, other in zip(step[1:], expected[1:], strict=True):
+            for one, other in zip(step[1:6], expected[1:6], strict=True):
                 assert np.array_equal(one[b], other[0])  # pyright: ignore[reportIndexIssue]
             seen = expected.observation.fov[0]
             if mode is AutoresetMode.SAME_STEP and ended[b]:
-                assert auto.final_observation is not None
-                assert np.array_equal(auto.final_observation.fov[final], seen)
+                assert step.final_observation is not None
+                assert np.array_equal(step.final_observation.fov[final], seen)
                 final += 1
                 seen = single.reset().fov[0]
             assert np.array_equal(step.observation.fov[b], seen)
-        assert (auto.final_observation is None) == (final == 0)
+        assert (step.final_observation is None) == (final == 0)
         due = ended
 
 
@@ -311,6 +428,34 @@ def test_smaller_instances_play_in_a_batch_as_they_play_alone() -> None:
         if (step.terminated | step.truncated).any():
             break
         seen, apart = step.observation, [one.observation for one in steps]
+
+
+def test_robots_that_are_not_there_earn_and_do_nothing_wherever_one_stood_before() -> None:
+    cases = [random_instance(num_agents=n, height=5, width=5, seed=n) for n in (1, 3, 9)]
+    settings: dict[str, Any] = {"num_agents": 9, "height": 5, "width": 5, "max_cycles": 3, "fill": True}
+    env = BatchedEnv(16, cases=cases, autoreset=AutoresetMode.SAME_STEP, **settings)
+    env.reset(seed=0)
+    generator, replaced = np.random.default_rng(0), 0
+    for _ in range(40):
+        missing = ~env.present
+        assert not env.on_goal()[missing].any()
+        step = env.step(generator.integers(0, 5, (16, 9)))
+        for part in (step.rewards, step.replaced, step.arrived):
+            assert not part[missing].any()
+        replaced += int(step.replaced.sum())
+    assert replaced > 0
+
+
+def test_the_radius_grows_at_reset_until_the_robots_that_are_there_are_connected() -> None:
+    cases = [random_instance(num_agents=n, height=9, width=9, seed=n) for n in (2, 3, 5, 8)]
+    settings: dict[str, Any] = {"num_agents": 8, "height": 9, "width": 9, "comm_radius": 1.0, "fill": True}
+    env = BatchedEnv(4, comm_range="connected", **settings)
+    env.reset(seed=0, instances=cases)
+    assert env.comm_radius.tolist() == [rules.connecting_radius(case.starts, 1.0) for case in cases]
+    assert (env.comm_radius > 1.0).all()
+    grown = env.comm_radius
+    env.step(np.full((4, 8), oracles.IDLE))
+    assert (env.comm_radius == grown).all(), "for the whole episode"
 
 
 def test_cases_are_drawn_by_the_seed() -> None:

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapf_env import EnvConfig, Instance, Solution, random_instance, replay
+from mapf_env import EnvConfig, Instance, Scene, Solution, random_instance, replay, replay_scenes
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 ACTIONS = """
 <script>{
 window.onerror = (message) => { document.body.dataset.said = JSON.stringify({error: message}); };
-const said = [], status = document.getElementById("status"), box = canvas.getBoundingClientRect();
+const {canvas, pen, status, side, W, H, last, paths} = state.panels[0];
+const said = [], box = canvas.getBoundingClientRect();
 const scale = Math.max(W * side / box.width, H * side / box.height);
 const click = (row, col) => canvas.dispatchEvent(new MouseEvent("click", {
   clientX: box.left + (col + 0.5) * side / scale, clientY: box.top + (row + 0.5) * side / scale}));
-const pixel = (row, col) => [...pen.getImageData((col + 0.5) * side, (row + 0.25) * side, 1, 1).data].slice(0, 3);
 said.push(status.textContent);
-click(data.paths[0][0][0], data.paths[0][0][1]);
+click(paths[0][0][0], paths[0][0][1]);
 said.push(status.textContent);
 slider.value = last; slider.oninput();
 said.push(status.textContent);
@@ -49,6 +49,7 @@ document.body.dataset.said = JSON.stringify({said, played, frames, paused: state
 STROKES = """
 <script>{
 let strokes = 0;
+const {pen} = state.panels[0];
 for (const name of ["arc", "drawImage", "fillRect", "lineTo", "strokeRect"]) {
   const draws = pen[name].bind(pen);
   pen[name] = (...where) => { strokes++; draws(...where); };
@@ -56,6 +57,27 @@ for (const name of ["arc", "drawImage", "fillRect", "lineTo", "strokeRect"]) {
 state.time = 0.5; state.chosen = 0;
 draw();
 document.body.dataset.said = JSON.stringify({strokes});
+}</script></body>"""
+
+SCENES = """
+<script>{
+const said = [], tell = () => said.push(state.panels.map(({status}) => status.textContent));
+const red = ({pen, side}, row, col) => {
+  const [r, g, b] = pen.getImageData((col + 0.5) * side, (row + 0.5 - 0.38) * side, 1, 1).data;
+  return r > 200 && g < 60 && b < 60;
+};
+const canvas = ({canvas}) => canvas.getBoundingClientRect();
+said.push([...choice.options].map((option) => option.text), choice.hidden);
+tell();
+choice.value = 1; choice.onchange();
+tell();
+slider.value = 4; slider.oninput();
+tell();
+said.push(state.panels.map((panel) => red(panel, 0, 1)));
+said.push([...document.querySelectorAll("h2")].map((heading) => heading.textContent));
+const [left, right] = state.panels.map(canvas);
+said.push(left.right < right.left && left.top === right.top);
+document.body.dataset.said = JSON.stringify({said});
 }</script></body>"""
 
 
@@ -85,6 +107,34 @@ def test_the_page_plays_pauses_scrubs_and_tells_what_a_robot_knows(tmp_path: Pat
     assert told["played"] == pytest.approx(5), "it has begun anew and plays five steps a second"
     assert told["frames"] == 50
     assert told["paused"] == told["played"]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
+def test_scenes_are_chosen_and_their_solutions_share_a_clock(tmp_path: Path) -> None:
+    alone = Instance(np.zeros((1, 3), bool), [[0, 0]], [[0, 2]])
+    drive, rest = Solution([[[0, 0]], [[0, 1]], [[0, 2]]]), Solution([[[0, 0]], [[0, 1]], [[0, 1]], [[0, 1]], [[0, 1]]])
+    scenes = [
+        Scene("first", alone, {"policy": rest}),
+        Scene("second", alone, {"policy": rest, "expert": drive}),
+    ]
+    told = browse(replay_scenes(scenes, title="two"), SCENES, tmp_path)
+    assert told["said"] == [
+        ["first", "second"],
+        False,
+        ["step 0 of 4, 0 of 1 on goal"],
+        ["step 0 of 4, 0 of 1 on goal", "step 0 of 2, 0 of 1 on goal"],
+        ["step 4 of 4, 0 of 1 on goal", "step 2 of 2, 1 of 1 on goal"],
+        [True, False],  # who is late at the end wears a red ring
+        ["policy", "expert"],
+        True,
+    ]
+
+
+def test_a_page_shows_something() -> None:
+    with pytest.raises(ValueError, match="no scenes"):
+        replay_scenes([], title="none")
+    with pytest.raises(ValueError, match="'empty' has no solution"):
+        replay_scenes([Scene("empty", random_instance(num_agents=2, seed=0), {})], title="none")
 
 
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")

@@ -1,0 +1,362 @@
+"""The paper's experiment: train its models, test them on maps they never saw, draw its figures beside its numbers.
+
+    python benchmarks/paper.py          everything, going on from where it was stopped
+    python benchmarks/paper.py plan     what is still to do, and how long that takes here
+    python benchmarks/paper.py train    the models alone, one run folder of gnn_policy.train each
+    python benchmarks/paper.py test     the finished models on the test maps
+    python benchmarks/paper.py draw     figures and tables of what has been tested
+
+Figure 2 is success and flowtime increase of models tested on teams of the size they were trained on, for K = 1, 2 and
+3; figure 3 tests every model with K = 3 on every size. Each finished model and each tested pair is a file; whatever is
+there is not done again.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import Progress
+
+from gnn_policy import checkpoint, evaluation
+from gnn_policy.config import RECIPES
+from gnn_policy.execution import Execution
+from gnn_policy.network import DecentralizedPolicy, PolicyConfig
+from gnn_policy.rollout import rollout
+from gnn_policy.training import split_cases
+from mapf_env.files import replacing, write_whole
+from mapf_env.generation import MapStyle
+
+Step = Literal["all", "plan", "train", "test", "draw"]
+
+TEAMS = (4, 6, 8, 10, 12, 14)
+PAPER = {
+    4: (0.9431, 0.8518, 0.7531, 0.5980, 0.4909, 0.3642),
+    6: (0.9638, 0.9313, 0.8747, 0.7916, 0.7058, 0.6227),
+    8: (0.9676, 0.9442, 0.9140, 0.8547, 0.7842, 0.7042),
+    10: (0.9647, 0.9520, 0.9249, 0.8984, 0.8544, 0.8136),
+    12: (0.9696, 0.9542, 0.9347, 0.9082, 0.8791, 0.8302),
+}
+"""Figure 3 of the paper: success rate, a row for each size of the training teams, a column for each of TEAMS."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which part of the experiment to do, and how much of it."""
+
+    step: tyro.conf.Positional[Step] = "all"
+    """"plan" says what is to do and how long it takes; "train", "test", "draw" are the parts of "all"."""
+    folder: Path = Path("runs/paper")
+    """Where models, results and figures go."""
+    train_on: tuple[int, ...] = tuple(PAPER)
+    """Sizes of the training teams."""
+    taps: tuple[int, ...] = (3, 2, 1)
+    """Filter taps K of the models; K = 1 does not communicate."""
+    styles: tuple[MapStyle, ...] = ("cells", "walls")
+    """Styles of the test maps, a table each."""
+    rows: tuple[str, ...] = ("argmax", "stuck", "sampled")
+    """How the policies are executed, as in gnn_policy.evaluate."""
+    cases_per_map: int = 50
+    """Test cases on each of 90 maps."""
+    threads: int = 1
+    """CPU threads of training, testing and the expert."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """One of the paper's models."""
+
+    num_agents: int
+    taps: int
+
+    @property
+    def name(self) -> str:
+        """The name of its run folder."""
+        return f"n{self.num_agents}-k{self.taps}"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The test cases of one table."""
+
+    style: MapStyle
+    num_agents: int
+    size: int = 20
+
+    @property
+    def name(self) -> str:
+        """The name of its results' folder."""
+        return f"{self.size}x{self.size}-{self.style}-n{self.num_agents}"
+
+
+LARGE = tuple((50, N) for N in (20, 40, 60))
+"""Side of the map and size of the team of the paper's large maps; models trained on 10 and more robots meet them."""
+
+
+class Experiment:
+    """The experiment as its options define it, and what is done of it."""
+
+    def __init__(self, options: Options, console: Console) -> None:
+        self.options, self.console = options, console
+        self.models = [Model(N, K) for K in options.taps for N in options.train_on]
+        self.scenes = [Scene(style, N) for style in options.styles for N in TEAMS]
+        self.scenes += [Scene(style, N, size) for style in options.styles for size, N in LARGE]
+
+    def plan(self) -> None:
+        """Say what is to do and how long it takes on this machine."""
+        torch.set_num_threads(self.options.threads)
+        untrained = [model for model in self.models if not self.is_trained(model)]
+        hours = sum(self._training_seconds(model) for model in untrained) / 3600
+        self.console.print(f"{len(self.models) - len(untrained)} of {len(self.models)} models are trained", end="; ")
+        self.console.print(f"the others take about {hours:.1f} hours with {self.options.threads} thread(s)")
+        pairs = list(self._pairs())
+        untested = sum(not self._result(scene, model.name).exists() for scene, model in pairs)
+        self.console.print(f"{len(pairs) - untested} of {len(pairs)} pairs of model and test cases are tested")
+
+    def train(self) -> None:
+        """Train what is not trained; each model resumes by itself."""
+        for model in self.models:
+            if self.is_trained(model):
+                continue
+            self.console.rule(f"training on {model.num_agents} robots, K = {model.taps}")
+            command = [sys.executable, "-m", "gnn_policy.train", "--recipe", "full", "--threads"]
+            command += [str(self.options.threads), "--num-agents", str(model.num_agents)]
+            command += ["--policy.taps", str(model.taps), "--run", str(self.run_of(model))]
+            subprocess.run(command, check=True)
+
+    def test(self) -> None:
+        """Play every trained model on the test cases; results that exist are kept."""
+        torch.set_num_threads(self.options.threads)
+        todo: dict[Scene, list[Model | None]] = {}
+        for scene in self.scenes:
+            if not self._result(scene, "baselines").exists():
+                todo.setdefault(scene, []).append(None)
+        for scene, model in self._pairs():
+            if self.is_trained(model) and not self._result(scene, model.name).exists():
+                todo.setdefault(scene, []).append(model)
+        with Progress(console=self.console) as progress:
+            task = progress.add_task("", total=sum(map(len, todo.values())))
+            for scene, players in todo.items():
+                progress.update(task, description=f"{scene.name}: expert")
+                exam = self._exam(scene)
+                for player in players:
+                    progress.update(task, description=f"{scene.name}: {player.name if player else 'baselines'}")
+                    rows = evaluation.baselines(exam) if player is None else self._scores(player, exam)
+                    result = {"cases_per_map": self.options.cases_per_map, **evaluation.as_json(rows, exam)}
+                    path = self._result(scene, player.name if player else "baselines")
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    write_whole(path, json.dumps(result, indent=2) + "\n")
+                    progress.advance(task)
+
+    def draw(self) -> None:
+        """Figures 2 and 3 and all tables of what has been tested."""
+        for style in self.options.styles:
+            for name, picture in (("figure2", self._figure2), ("figure3", self._figure3)):
+                figure = picture(style)
+                path = self.options.folder / f"{name}-{style}.png"
+                with replacing(path) as draft:
+                    figure.savefig(draft, format="png", dpi=150)
+                plt.close(figure)
+                self.console.print(path, highlight=False)
+        path = self.options.folder / "results.md"
+        write_whole(path, "\n".join(self._tables()) + "\n")
+        self.console.print(path, highlight=False)
+
+    def run_of(self, model: Model) -> Path:
+        """The run folder of a model."""
+        return self.options.folder / model.name
+
+    def is_trained(self, model: Model) -> bool:
+        """Whether its training has come to its end."""
+        return (self.run_of(model) / "results.json").exists()
+
+    def _pairs(self) -> Iterator[tuple[Scene, Model]]:
+        """Which model is tested where."""
+        for scene in self.scenes:
+            for model in self.models:
+                own_size = scene.size == 20 and scene.num_agents == model.num_agents
+                general = model.taps == 3 and (scene.size == 20 or model.num_agents >= 10)
+                if own_size or general:
+                    yield scene, model
+
+    def _result(self, scene: Scene, player: str) -> Path:
+        return self.options.folder / "results" / scene.name / f"{player}.json"
+
+    def _exam(self, scene: Scene) -> evaluation.Exam:
+        config = replace(
+            RECIPES["full"],
+            styles=(scene.style,),
+            height=scene.size,
+            width=scene.size,
+            cases_per_map=self.options.cases_per_map,
+        )
+        cases = split_cases(config, "test", scene.num_agents)
+        return evaluation.Exam.prepare(cases, w=config.w, timeout=config.timeout, threads=self.options.threads)
+
+    def _scores(self, model: Model, exam: evaluation.Exam) -> list[evaluation.Score]:
+        policy = checkpoint.load(self.run_of(model))
+        variants = [Execution.parse(row) for row in self.options.rows]
+        return [
+            evaluation.score(
+                variant.name, exam, rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(variant))
+            )
+            for variant in variants
+        ]
+
+    def _training_seconds(self, model: Model) -> float:
+        """What the gradient steps of a training take here, and a quarter more for all else."""
+        config = RECIPES["full"]
+        updates = config.epochs * (config.updates_per_epoch or 0)
+        policy = DecentralizedPolicy(PolicyConfig(encoder="lean", taps=model.taps))
+        optimizer = torch.optim.Adam(policy.parameters(), fused=True)
+        fov = torch.zeros(config.batch_size, model.num_agents, 3, 11, 11)
+        graph = torch.zeros(config.batch_size, model.num_agents, model.num_agents)
+        steps = 20
+        for warm in (True, False):
+            began = time.perf_counter()
+            for _ in range(2 if warm else steps):
+                optimizer.zero_grad()
+                policy(fov, graph).square().mean().backward()
+                optimizer.step()
+        return 1.25 * updates * (time.perf_counter() - began) / steps
+
+    def _row(self, scene: Scene, player: str, row: str) -> dict[str, Any] | None:
+        path = self._result(scene, player)
+        if not path.exists():
+            return None
+        rows = {each["name"]: each for each in json.loads(path.read_text())["rows"]}
+        return rows.get(row)
+
+    def _figure2(self, style: MapStyle) -> Figure:
+        figure, panels = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+        measures = (("success_rate", "success rate"), ("flowtime_increase", "flowtime increase"))
+        for axes, (measure, label) in zip(panels, measures, strict=True):
+            for taps in sorted(self.options.taps):
+                for row, line in zip(self.options.rows, ("-", "--", ":"), strict=False):
+                    self._line(axes, style, taps, row, measure, line)
+            axes.set(xlabel="robots, in training and test", ylabel=label, xticks=list(self.options.train_on))
+            axes.grid(alpha=0.3)
+        known = [N for N in self.options.train_on if N in PAPER]
+        diagonal = [PAPER[N][TEAMS.index(N)] for N in known]
+        panels[0].plot(known, diagonal, "kx", label="paper, K = 3")
+        panels[0].legend(fontsize=7)
+        figure.suptitle(f"Figure 2, {style} maps: what communication adds")
+        return figure
+
+    def _line(self, axes: Axes, style: MapStyle, taps: int, row: str, measure: str, line: str) -> None:
+        tested = {
+            N: found[measure]
+            for N in self.options.train_on
+            if (found := self._row(Scene(style, N), Model(N, taps).name, row))
+        }
+        if not tested:
+            return
+        mean = np.array([each["mean"] for each in tested.values()])
+        low, high = (np.array([each[end] for each in tested.values()]) for end in ("low", "high"))
+        axes.errorbar(
+            list(tested),
+            mean,
+            [mean - low, high - mean],
+            fmt=line,
+            color=f"C{taps}",
+            capsize=2,
+            label=f"K = {taps}, {row}",
+        )
+
+    def _figure3(self, style: MapStyle) -> Figure:
+        ours = self._heat(style, self.options.rows[0])
+        paper = np.array([PAPER[N] for N in PAPER])
+        figure, panels = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+        pictures = (
+            ("paper", paper, "viridis", 0.3, 1.0),
+            (f"here, {self.options.rows[0]}", ours, "viridis", 0.3, 1.0),
+            ("difference", ours - paper, "RdYlGn", -0.3, 0.3),
+        )
+        for axes, (title, values, colours, low, high) in zip(panels, pictures, strict=True):
+            axes.imshow(values, cmap=colours, vmin=low, vmax=high)
+            for i, j in np.argwhere(np.isfinite(values)):
+                text = f"{values[i, j]:+.3f}" if title == "difference" else f"{values[i, j]:.3f}"
+                axes.text(j, i, text, ha="center", va="center", fontsize=8)
+            axes.set(title=title, xlabel="robots in test", ylabel="robots in training")
+            axes.set_xticks(range(len(TEAMS)), TEAMS)
+            axes.set_yticks(range(len(PAPER)), list(PAPER))
+        figure.suptitle(f"Figure 3, {style} maps: success rate, K = 3")
+        return figure
+
+    def _heat(self, style: MapStyle, row: str) -> np.ndarray:
+        """(5, 6) success rates of our models with K = 3, not a number where one is not tested."""
+        values = np.full((len(PAPER), len(TEAMS)), np.nan)
+        for i, trained_on in enumerate(PAPER):
+            for j, N in enumerate(TEAMS):
+                if found := self._row(Scene(style, N), Model(trained_on, 3).name, row):
+                    values[i, j] = found["success_rate"]["mean"]
+        return values
+
+    def _tables(self) -> Iterator[str]:
+        for style in self.options.styles:
+            for size in dict.fromkeys(scene.size for scene in self.scenes):
+                scenes = [scene for scene in self.scenes if (scene.style, scene.size) == (style, size)]
+                yield f"## {style} maps, {size} x {size}\n"
+                for measure in ("success_rate", "flowtime_increase", "flowtime_increase_solved", "makespan"):
+                    yield f"### {measure.replace('_', ' ')}\n"
+                    yield from self._table(scenes, measure)
+                    yield ""
+
+    def _table(self, scenes: Sequence[Scene], measure: str) -> Iterator[str]:
+        yield "| player | " + " | ".join(str(scene.num_agents) for scene in scenes) + " |"
+        yield "|---|" + "---|" * len(scenes)
+        players = [(model.name, row) for model in self.models for row in self.options.rows]
+        baselines = [("baselines", row) for row in self._names_of_baselines(scenes)]
+        for player, row in [*players, *baselines]:
+            found = [self._row(scene, player, row) for scene in scenes]
+            if not any(found):
+                continue
+            cells = [_cell(each[measure]) if each else "" for each in found]
+            yield f"| {row if player == 'baselines' else f'{player} {row}'} | " + " | ".join(cells) + " |"
+        if measure == "success_rate" and scenes[0].size == 20:
+            for trained_on, values in PAPER.items():
+                yield f"| paper, trained on {trained_on} | " + " | ".join(f"{value:.3f}" for value in values) + " |"
+
+    def _names_of_baselines(self, scenes: Sequence[Scene]) -> list[str]:
+        for scene in scenes:
+            path = self._result(scene, "baselines")
+            if path.exists():
+                return [row["name"] for row in json.loads(path.read_text())["rows"]]
+        return []
+
+
+def _cell(estimate: dict[str, float | None]) -> str:
+    mean, low, high = (estimate[name] for name in ("mean", "low", "high"))
+    if mean is None or low is None or high is None:
+        return "-"
+    return f"{mean:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def main(options: Options) -> None:
+    """Do the chosen part."""
+    experiment = Experiment(options, Console())
+    if options.step in ("all", "plan"):
+        experiment.plan()
+    if options.step in ("all", "train"):
+        experiment.train()
+    if options.step in ("all", "test"):
+        experiment.test()
+    if options.step in ("all", "draw"):
+        experiment.draw()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))

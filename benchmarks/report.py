@@ -1,0 +1,235 @@
+"""One page about training runs: `python benchmarks/report.py RUNS...`.
+
+Learning curves, success and flowtime against the number of robots beside the paper's, why teams failed with replays of
+examples, and tables of speed. The page is one file that needs no network. A run folder gives what it has: `metrics.csv`
+comes from training, `results.json` from `python -m gnn_policy.evaluate RUN --num-agents ... --failures K`, which leaves
+`failures.html` beside it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import date
+from html import escape
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from paper import PAPER, TEAMS
+
+from gnn_policy.command_line import mistakes_in_one_line
+from gnn_policy.failures import Failure
+from mapf_env.files import write_whole
+
+STYLE = """
+body{margin:0;font:15px/1.5 system-ui,sans-serif;background:#f6f7f9;color:#1f2530}
+main{max-width:1000px;margin:auto;padding:16px}
+h1{font-size:24px}h2{font-size:19px;margin-top:36px}
+section{display:flex;flex-wrap:wrap;gap:12px}
+section svg{flex:1 1 330px;min-width:0;max-width:100%;height:auto}
+div.wide{overflow-x:auto}
+table{border-collapse:collapse;background:#fff}
+td,th{border:1px solid #cbd2da;padding:4px 9px;text-align:right;white-space:nowrap}
+td:first-child,th:first-child{text-align:left}
+iframe{width:100%;height:760px;border:1px solid #cbd2da;border-radius:6px;background:#fff}
+pre{background:#fff;border:1px solid #cbd2da;padding:10px;overflow-x:auto;font-size:12px}
+"""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write one page about training runs."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders of `gnn_policy.train`."""
+    speed: tuple[Path, ...] = ()
+    """What benchmarks/speed.py, solvers.py or training.py printed, as text files."""
+    out: Path = Path("report.html")
+    """The page."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run folder holds."""
+
+    name: str
+    trained_on: int
+    """Robots in a training team."""
+    metrics: list[dict[str, str]]
+    """A row for each round."""
+    results: dict[str, Any]
+    """Tables by the number of robots; empty if the run was not examined."""
+    failures: str | None
+    """The page of the worst cases."""
+
+    @staticmethod
+    def load(folder: Path) -> Run:
+        """Read a run folder.
+
+        Raises:
+            FileNotFoundError: If it is none.
+        """
+        if not (folder / "config.json").is_file():
+            raise FileNotFoundError(f"{folder} is no run folder of gnn_policy.train: it has no config.json")
+        metrics = folder / "metrics.csv"
+        home = next((each for each in (folder / "evaluation", folder) if (each / "results.json").is_file()), None)
+        page = (home or folder) / "failures.html"
+        return Run(
+            folder.name,
+            json.loads((folder / "config.json").read_text(encoding="utf-8"))["num_agents"],
+            list(csv.DictReader(io.StringIO(metrics.read_text(encoding="utf-8")))) if metrics.is_file() else [],
+            json.loads((home / "results.json").read_text(encoding="utf-8"))["num_agents"] if home else {},
+            page.read_text(encoding="utf-8") if page.is_file() else None,
+        )
+
+    def rows(self) -> list[str]:
+        """The names of the ways in which the policy was executed."""
+        return list(next(iter(self.results.values()))["failures"]) if self.results else []
+
+    def estimates(self, row: str, measure: str) -> Iterator[tuple[int, float]]:
+        """Number of robots and mean of a measure, where there is one."""
+        for size, table in self.results.items():
+            (found,) = [each for each in table["rows"] if each["name"].removesuffix(",cost-to-go*") == row]
+            if found[measure]["mean"] is not None:
+                yield int(size), found[measure]["mean"]
+
+
+def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
+    """The report as HTML."""
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    names = ", ".join(run.name for run in runs)
+    parts = [
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
+        f"<title>{escape(names)}</title><style>{STYLE}</style></head><body><main><h1>{escape(names)}</h1>"
+        f"<p>{date.today()}, commit {escape(commit.stdout.strip() or 'unknown')}</p>"
+    ]
+    if any(run.metrics for run in runs):
+        parts += ["<h2>Learning curves</h2>", curves([run for run in runs if run.metrics])]
+    examined = [run for run in runs if run.results]
+    if examined:
+        parts += ["<h2>Success and flowtime against the number of robots</h2>", against_robots(examined)]
+        parts += ["<h2>Success beside the paper's</h2>", heat_maps(examined)]
+        parts += ["<h2>Why teams failed</h2>", failure_table(examined)]
+    for run in examined:
+        if run.failures is not None:
+            parts.append(
+                f'<h3>{escape(run.name)}</h3><iframe title="replays" srcdoc="{escape(run.failures)}"></iframe>'
+            )
+    if speed:
+        parts.append("<h2>Speed</h2>")
+        parts += [f"<h3>{escape(name)}</h3><pre>{escape(text)}</pre>" for name, text in speed.items()]
+    return "\n".join([*parts, "</main></body></html>", ""])
+
+
+def curves(runs: Sequence[Run]) -> str:
+    """Validation success and loss against the robot states trained on."""
+    success, loss = axes(), axes()
+    for run in runs:
+        known = [each for each in run.metrics if each["validation_success"]]
+        xs = [int(each["samples"]) / 1e6 for each in known]
+        success.plot(xs, [float(each["validation_success"]) for each in known], marker=".", label=run.name)
+        loss.plot([int(each["samples"]) / 1e6 for each in run.metrics], [float(each["loss"]) for each in run.metrics])
+    success.set(xlabel="million robot states", ylabel="validation success, argmax")
+    loss.set(xlabel="million robot states", ylabel="cross-entropy")
+    success.legend()
+    return side_by_side(success, loss)
+
+
+def against_robots(runs: Sequence[Run]) -> str:
+    """Every way of execution, with the paper's row of the same training teams."""
+    success, flowtime = axes(), axes()
+    for run in runs:
+        for row in run.rows():
+            label = f"{run.name}, {row}"
+            success.plot(*np.transpose(list(run.estimates(row, "success_rate"))), marker="o", label=label)
+            flowtime.plot(*np.transpose(list(run.estimates(row, "flowtime_increase"))), marker="o")
+    for size in sorted({run.trained_on for run in runs} & set(PAPER)):
+        success.plot(TEAMS, PAPER[size], linestyle="--", color="black", label=f"paper, trained on {size}")
+    success.set(xlabel="robots", ylabel="success rate", ylim=(None, 1.005))
+    flowtime.set(xlabel="robots", ylabel="flowtime increase")
+    success.legend(fontsize="small")
+    return side_by_side(success, flowtime)
+
+
+def heat_maps(runs: Sequence[Run]) -> str:
+    """Success of the first way of execution, training teams by test teams, and the paper's."""
+    ours = {run.trained_on: dict(run.estimates(run.rows()[0], "success_rate")) for run in runs}
+    paper = {size: dict(zip(TEAMS, row, strict=True)) for size, row in PAPER.items()}
+    columns = sorted({size for row in (*ours.values(), *paper.values()) for size in row})
+    sizes = sorted({*ours, *paper})
+    return side_by_side(
+        heat_map(f"ours, {runs[0].rows()[0]}", ours, sizes, columns), heat_map("paper", paper, sizes, columns)
+    )
+
+
+def heat_map(name: str, table: dict[int, dict[int, float]], sizes: Sequence[int], columns: Sequence[int]) -> Axes:
+    """A cell for each pair of training and test teams; white where there is no number."""
+    map_axes = axes()
+    values = np.array([[table.get(size, {}).get(column, np.nan) for column in columns] for size in sizes])
+    map_axes.imshow(values, vmin=0.3, vmax=1, cmap="viridis", aspect="auto")
+    map_axes.set(title=name, xlabel="test robots", ylabel="trained on")
+    map_axes.set_xticks(range(len(columns)), list(map(str, columns)))
+    map_axes.set_yticks(range(len(sizes)), list(map(str, sizes)))
+    for (i, j), value in np.ndenumerate(values):
+        if not np.isnan(value):
+            colour = "w" if value < 0.8 else "k"
+            map_axes.text(j, i, f"{value:.3f}".removeprefix("0"), ha="center", va="center", color=colour)
+    return map_axes
+
+
+def failure_table(runs: Sequence[Run]) -> str:
+    """How many cases failed in which way."""
+    kinds = get_args(Failure)
+    head = "".join(f"<th>{name}</th>" for name in ("run", "robots", "execution", "cases", *kinds))
+    lines = [
+        "".join(
+            f"<td>{escape(str(cell))}</td>"
+            for cell in (run.name, size, row, table["cases"], *(found.get(kind, 0) for kind in kinds))
+        )
+        for run in runs
+        for size, table in run.results.items()
+        for row, found in table["failures"].items()
+    ]
+    return (
+        f'<div class="wide"><table><tr>{head}</tr>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+    )
+
+
+def axes() -> Axes:
+    """An empty diagram."""
+    return Figure(figsize=(4.6, 3.5), layout="constrained").subplots()
+
+
+def side_by_side(*diagrams: Axes) -> str:
+    """Diagrams as SVG that stands in HTML, below one another on a phone."""
+    pictures = []
+    for diagram in diagrams:
+        file = io.StringIO()
+        diagram.figure.savefig(file, format="svg", metadata={"Date": None})
+        pictures.append(file.getvalue()[file.getvalue().index("<svg") :])
+    return f"<section>{''.join(pictures)}</section>"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    with mistakes_in_one_line():
+        options = tyro.cli(Options, args=arguments, prog="python benchmarks/report.py", description=__doc__)
+        if not options.runs:
+            raise ValueError("give at least one run folder of gnn_policy.train")
+        runs = [Run.load(folder) for folder in options.runs]
+        speed = {file.name: file.read_text(encoding="utf-8") for file in options.speed}
+        write_whole(options.out, page(runs, speed))
+        print(f"report: {options.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""Why a team failed, told from its executed paths alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from gnn_policy.rollout import Rollouts
+from mapf_env import Instance, Scene, Solution, _native
+
+Failure = Literal["goal blocked", "deadlock", "oscillation", "livelock", "out of time"]
+
+LAST_STEPS = 16
+"""How many steps at the end of an episode tell why it failed."""
+
+
+def failure(instance: Instance, solution: Solution) -> Failure | None:
+    """The kind of failure, or None where all robots end on their goals.
+
+    A robot is late if it ends off its goal, and stuck if it is late and came no nearer to its goal (by shortest ways on
+    the empty map) in the last steps than it had ever been before. The first that holds:
+
+    - "out of time": nobody is stuck; with more steps the team might have done it.
+    - "goal blocked": robots that rest on their own goals throughout the last steps cut off a stuck robot from its own.
+    - "deadlock": the stuck robots stand still throughout the last steps.
+    - "oscillation": each of them stays on at most two cells, some to and fro.
+    - "livelock": they move about and get nowhere.
+
+    Args:
+        instance: The problem.
+        solution: Paths (T + 1, N, 2) over its free cells.
+
+    Raises:
+        ValueError: If the paths are of another number of agents.
+    """
+    if solution.paths.shape[1] != instance.num_agents:
+        raise ValueError(f"{solution.paths.shape[1]} paths for {instance.num_agents} agents")
+    paths = solution.paths
+    late = (paths[-1] != instance.goals).any(axis=1)
+    if not late.any():
+        return None
+    first = max(len(paths) - 1 - LAST_STEPS, 0)
+    recent = paths[first:]
+    rows, cols = paths[..., 0], paths[..., 1]
+    robots = np.arange(instance.num_agents)
+    distances = _native.distances(instance.grid, instance.goals)[robots, rows, cols]
+    stuck = late & (distances[first:].min(axis=0) >= distances[: first + 1].min(axis=0))
+    if not stuck.any():
+        return "out of time"
+    resting = (recent == instance.goals).all(axis=(0, 2))
+    if any(_cut_off(instance, paths[-1, robot], instance.goals[robot], resting) for robot in np.flatnonzero(stuck)):
+        return "goal blocked"
+    visited = [len(np.unique(recent[:, robot], axis=0)) for robot in np.flatnonzero(stuck)]
+    return "deadlock" if max(visited) == 1 else "oscillation" if max(visited) == 2 else "livelock"
+
+
+def _cut_off(
+    instance: Instance, cell: npt.NDArray[np.integer], goal: npt.NDArray[np.integer], resting: npt.NDArray[np.bool_]
+) -> bool:
+    """Whether no way leads from the cell to the goal around the robots that rest on their goals."""
+    blocked = instance.grid.copy()
+    blocked[tuple(instance.goals[resting].T)] = True
+    return bool(_native.distances(blocked, goal[None])[0, cell[0], cell[1]] < 0)
+
+
+def count_failures(played: Rollouts) -> dict[Failure, int]:
+    """How many of the played cases failed in each of the ways."""
+    found = Counter(failure(*case) for case in zip(played.instances, played.solutions, strict=True))
+    return {kind: found[kind] for kind in get_args(Failure) if found[kind]}
+
+
+def worst(played: Rollouts, expert: Sequence[Solution], count: int) -> list[Scene]:
+    """Up to `count` of the played cases beside the expert's solutions, the worst first.
+
+    Failed cases come before solved ones, those with more robots off their goals before others, then those whose
+    flowtime exceeds the expert's by more.
+    """
+    off_goal = [
+        int((solution.paths[-1] != instance.goals).any(axis=1).sum())
+        for instance, solution in zip(played.instances, played.solutions, strict=True)
+    ]
+    costs = np.array([each.sum_of_costs for each in expert])
+    increase = (played.flowtime - costs) / np.maximum(costs, 1)
+    order = np.lexsort([-increase, -np.array(off_goal)])[:count]
+    return [
+        Scene(
+            f"{instance.num_agents} robots, case {case}: {_outcome(instance, played.solutions[case], off_goal[case])}, "
+            f"flowtime {increase[case]:+.0%}",
+            instance,
+            {"policy": played.solutions[case], "expert": expert[case]},
+        )
+        for case, instance in ((int(case), played.instances[case]) for case in order)
+    ]
+
+
+def _outcome(instance: Instance, solution: Solution, off_goal: int) -> str:
+    kind = failure(instance, solution)
+    return "solved" if kind is None else f"{kind}, {off_goal} not on goal"

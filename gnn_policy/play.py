@@ -1,0 +1,102 @@
+"""`python -m gnn_policy.play FILE`: a policy on a map of one's own, as a page that replays it; no expert is needed."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from rich.console import Console
+
+from gnn_policy import checkpoint
+from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
+from gnn_policy.execution import Execution
+from gnn_policy.failures import failure
+from gnn_policy.rollout import rollout
+from mapf_env import EnvConfig, Instance, _native, load_map, load_scen, random_instance, replay
+
+PATIENCE = 4
+"""T_max in lengths of the longest way that a robot has to go."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Play a policy on a map of your own and write a page that replays it in any browser."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """A map (.map) in the MovingAI format, or a scenario (.scen) beside its map."""
+    agents: int | None = None
+    """How many robots: placed at random on a map, the first ones of a scenario (all of them if not given)."""
+    run: Path = checkpoint.PACKAGED
+    """A run folder of training, or a .safetensors file; the policy that comes with the package if not given."""
+    map: Path | None = None
+    """The map of a scenario, if it does not lie beside it."""
+    row: str = "stuck"
+    """How to execute the policy, in the words of the rows of `python -m gnn_policy.evaluate`."""
+    max_steps: int | None = None
+    """T_max; four times the longest way that a robot has to go if not given."""
+    seed: int = 0
+    """Of the robots' places, the draws and the shield's tie-breaking."""
+    out: Path | None = None
+    """The page; the name of FILE with .html in the working folder if not given."""
+    threads: int = 0
+    """CPU threads; 0 takes all that the process may use."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    with mistakes_in_one_line():
+        command = tyro.cli(
+            Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.play"
+        )
+        torch.set_num_threads(cpu_threads(command.threads))
+        policy, execution = checkpoint.load(command.run), Execution.parse(command.row)
+        instance = _problem(command)
+        steps = _patience(instance) if command.max_steps is None else command.max_steps
+        out = command.out or Path(f"{command.file.stem}.html")
+        if not out.parent.is_dir():
+            raise FileNotFoundError(f"{out.parent} is no folder: make it, or give another --out")
+        if out.is_dir():
+            raise FileExistsError(f"{out} is a folder: give the name of a file with --out")
+        console = Console()
+        size = f"{instance.num_agents} robots on {instance.grid.shape[0]} x {instance.grid.shape[1]} cells"
+        before = time.perf_counter()
+        with console.status(f"{size}, {steps} steps at most"):
+            played = rollout(policy, [instance], seed=command.seed, max_steps=steps, **asdict(execution))
+        seconds = time.perf_counter() - before
+        (solution,) = played.solutions
+        home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
+        kind = failure(instance, solution)
+        told = f"{size}: {home} on goal after {len(solution.paths) - 1} steps"
+        told += f", flowtime {solution.sum_of_costs}" if kind is None else f", failed: {kind}"
+        radii = EnvConfig(fov_radius=policy.config.fov_radius, comm_radius=policy.config.comm_radius)
+        replay(instance, solution, out, title=told, config=radii)
+        console.print(f"{told} ({seconds:.1f} s)", highlight=False)
+        console.print(f"replay: {out}", highlight=False, soft_wrap=True)
+
+
+def _problem(command: Command) -> Instance:
+    if command.file.suffix == ".scen":
+        return load_scen(command.file, command.agents, command.map)
+    if command.file.suffix != ".map":
+        raise ValueError(f"{command.file} must be a map (.map) or a scenario (.scen)")
+    if command.map is not None:
+        raise ValueError("--map goes with a scenario only: the map is given already")
+    if command.agents is None:
+        raise ValueError("robots on a map are placed at random: give --agents N (and --seed S)")
+    return random_instance(grid=load_map(command.file), num_agents=command.agents, seed=command.seed)
+
+
+def _patience(instance: Instance) -> int:
+    distances = _native.distances(instance.grid, instance.goals)
+    ways = distances[range(instance.num_agents), instance.starts[:, 0], instance.starts[:, 1]]
+    return max(PATIENCE * int(ways.max()), 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""One robot on its own: a policy executed from its own view and the messages of its neighbours."""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from gnn_policy.execution import STUCK_MEMORY, Execution
+from gnn_policy.network import DecentralizedPolicy
+
+Features = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """What a robot sends to all its neighbours in one round."""
+
+    features: Features
+    """(F,) what it has gathered, over the root of its degree."""
+    stuck: bool
+    """Whether it is stuck (`gnn_policy.execution.is_stuck`)."""
+
+    def to_bytes(self) -> bytes:
+        """One byte, then the features as little-endian float32: 4 F + 1 bytes, 513 for the paper's F = 128."""
+        return struct.pack("<?", self.stuck) + self.features.astype("<f4").tobytes()
+
+    @staticmethod
+    def from_bytes(data: bytes) -> Message:
+        """What `to_bytes` wrote.
+
+        Raises:
+            ValueError: If the length is not that of a message.
+        """
+        if len(data) % 4 != 1 or data[0] > 1:
+            raise ValueError(f"{len(data)} bytes are no message: it has one byte, 0 or 1, and 4 for each feature")
+        return Message(np.frombuffer(data, "<f4", offset=1).astype(np.float32), bool(data[0]))
+
+
+class Robot:
+    """A robot that runs a policy by itself.
+
+    A step is: `begin` with what it sees and whom it hears, then for each of `rounds` exchanges send `message` and
+    `hear` those of the same round, then `act`. All robots of a team together do exactly what the network does for the
+    team at once.
+
+    The graph shift D^-1/2 A D^-1/2 needs the degree of each neighbour. A robot knows its own, the sum of the weights of
+    the links on which it hears; it divides what it sends by the degree's root, and what it has received likewise, so
+    degrees travel inside the features and cost no byte.
+
+    Args:
+        policy: The policy; its weights are shared, and it is put into evaluation mode.
+        execution: How it chooses moves; shield and communication range are matters of the world and of no account here.
+        seed: Of its draws; robots of one team need different ones.
+    """
+
+    def __init__(self, policy: DecentralizedPolicy, execution: Execution = Execution(), seed: int = 0) -> None:
+        if not 0 <= seed < 2**64:
+            raise ValueError(f"seed must lie in 0..2**64 - 1, got {seed}")
+        self._policy, self._execution = policy.eval(), execution
+        self._seed = np.array(seed, np.uint64)
+        self._track: deque[tuple[int, int]] = deque(maxlen=STUCK_MEMORY)
+        self._time = -1
+        self._links: dict[Hashable, float] = {}
+        self._gathered: list[Features] = []
+        self._stuck = self._alarmed = False
+
+    @property
+    def rounds(self) -> int:
+        """How many messages it sends in a step: K - 1."""
+        return self._policy.config.taps - 1
+
+    @property
+    def links(self) -> Mapping[Hashable, float]:
+        """The neighbours that it hears in this step and the weights of their links."""
+        return self._links
+
+    def begin(self, view: npt.NDArray[Any], links: Mapping[Hashable, float], cell: tuple[int, int]) -> None:
+        """Start a step.
+
+        Args:
+            view: (C, F, F) what it sees, as `mapf_env` shows it.
+            links: The weights of the links to the neighbours that it hears, by whatever names they have: 1, or 1 /
+                distance for a policy whose comm_weights are "distance".
+            cell: Where it stands, in any frame that stays the same, as its odometry's.
+
+        Raises:
+            ValueError: If the view is not one that the policy reads, or a weight is not positive.
+        """
+        wrong = [name for name, weight in links.items() if not 0 < weight < np.inf]
+        if wrong:
+            raise ValueError(f"links must have positive weights, got {links[wrong[0]]} to {wrong[0]!r}")
+        with torch.inference_mode():
+            extracted = self._policy.extract(self._tensor(view)[None])[0].cpu().numpy()
+        self._time += 1
+        self._links, self._gathered = dict(links), [extracted]
+        centre = view.shape[-1] // 2
+        on_goal = bool(view[1, centre, centre])
+        self._stuck = self._alarmed = not on_goal and cell in self._track
+        self._track.append(cell)
+
+    @property
+    def message(self) -> Message:
+        """What it sends to its neighbours in this round."""
+        if not self._gathered or len(self._gathered) > self.rounds:
+            raise RuntimeError(f"there are {self.rounds} rounds in a step: begin() the next step or act()")
+        return Message(self._scaled(self._gathered[-1]), self._stuck)
+
+    def hear(self, messages: Mapping[Hashable, Message]) -> None:
+        """Take the messages that the neighbours sent in this round.
+
+        Raises:
+            ValueError: If they are not those of the links, or of another policy.
+            RuntimeError: If the rounds of the step are over.
+        """
+        own = self.message.features
+        if messages.keys() != self._links.keys():
+            odd = next(iter(messages.keys() ^ self._links.keys()))
+            raise ValueError(f"expected one message on each link, and no other; look at {odd!r}")
+        total = np.zeros_like(own)
+        for name, message in messages.items():
+            if message.features.shape != own.shape:
+                raise ValueError(f"{name!r} sent {message.features.shape} features, this policy has {own.shape}")
+            total += np.float32(self._links[name]) * message.features
+            self._alarmed |= message.stuck
+        self._gathered.append(self._scaled(total))
+
+    def logits(self) -> Features:
+        """(5,) the logits of its moves.
+
+        Raises:
+            RuntimeError: If rounds are missing.
+        """
+        if len(self._gathered) != self.rounds + 1:
+            raise RuntimeError(f"it heard {len(self._gathered) - 1} of {self.rounds} rounds: begin() and hear() first")
+        with torch.inference_mode():
+            filtered = self._policy.filter.mix(self._tensor(np.concatenate(self._gathered)))
+            return self._policy.decide(filtered).cpu().numpy()
+
+    def act(self) -> int:
+        """The move that it wants, 0..4; the world's shield has the last word.
+
+        Raises:
+            RuntimeError: If rounds are missing.
+        """
+        values = self._execution.values(self.logits(), np.array(self._alarmed), self._seed, self._time)
+        return int(values.argmax())
+
+    def _scaled(self, features: Features) -> Features:
+        degree = sum(self._links.values())
+        return features / np.float32(degree) ** np.float32(0.5) if degree > 0 else np.zeros_like(features)
+
+    def _tensor(self, array: npt.NDArray[Any]) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self._policy.head.weight.device)

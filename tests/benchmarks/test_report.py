@@ -1,0 +1,82 @@
+"""The report shows what the run folders hold, and nothing is fetched."""
+
+import json
+import re
+import subprocess
+import sys
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "report.py"
+
+
+def estimate(mean: float) -> dict[str, float]:
+    return {"mean": mean, "low": mean, "high": mean}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run folder as training and evaluation leave it."""
+    folder = tmp_path / "run<1>"
+    (folder / "evaluation").mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"num_agents": 10}))
+    (folder / "metrics.csv").write_text(
+        "round,samples,loss,validation_success\n0,1000000,1.5,\n1,2000000,0.9,0.61\n2,3000000,0.7,0.83\n"
+    )
+    tables = {
+        str(size): {
+            "cases": 90,
+            "rows": [
+                {
+                    "name": name + ",cost-to-go*",
+                    "success_rate": estimate(success),
+                    "flowtime_increase": estimate(0.1),
+                }
+                for name, success in (("argmax", 0.876 - size / 1000), ("stuck,1", 0.99))
+            ],
+            "failures": {"argmax": {"deadlock": 11, "livelock": 3}, "stuck,1": {}},
+        }
+        for size in (4, 10)
+    }
+    (folder / "evaluation" / "results.json").write_text(json.dumps({"settings": {}, "num_agents": tables}))
+    (folder / "evaluation" / "failures.html").write_text("<!doctype html><p>\"worst\" & 'cases'</p>")
+    return folder
+
+
+def report(*arguments: object, folder: Path) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, str(SCRIPT), *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_the_page_has_curves_tables_replays_and_speed(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "speed.txt").write_text("9 million <steps>")
+    done = report(run, "--speed", "speed.txt", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page.count("<svg") == 6
+    for cells in (
+        ("run<1>", 4, "argmax", 90, 0, 11, 0, 3, 0),
+        ("run<1>", 10, "stuck,1", 90, 0, 0, 0, 0, 0),
+    ):
+        row = "".join(f"<td>{cell}</td>" for cell in cells)
+        assert row in page.replace("run&lt;1&gt;", "run<1>")
+    (replays,) = re.findall('srcdoc="([^"]*)"', page)
+    assert unescape(replays) == "<!doctype html><p>\"worst\" & 'cases'</p>"
+    assert "9 million &lt;steps&gt;" in page
+    assert not re.findall(r'(?:src|href)="(?!#)', page), "the page fetches something"
+
+
+def test_a_run_that_was_not_examined_has_its_curves(run: Path, tmp_path: Path) -> None:
+    (run / "evaluation" / "results.json").unlink()
+    assert report(run, "--out", "other.html", folder=tmp_path).returncode == 0
+    assert (tmp_path / "other.html").read_text(encoding="utf-8").count("<svg") == 2
+
+
+@pytest.mark.parametrize(("arguments", "words"), [(["none"], "none is no run folder"), ([], "at least one run")])
+def test_a_mistake_takes_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
+    done = report(*arguments, folder=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert words in done.stderr

@@ -1,0 +1,132 @@
+"""The command that plays a policy on a map of one's own and writes a page."""
+
+import json
+import re
+from dataclasses import asdict, fields
+
+import pytest
+import torch
+
+import oracles
+from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, play, rollout, save
+from mapf_env import load_scen, random_instance, save_map, save_scen
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """A working folder with a map, a scenario and an untrained policy."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    instance = random_instance(height=9, width=12, density=0.2, num_agents=6, seed=3)
+    save_map("own.map", instance.grid)
+    save_scen("own.scen", instance, "own.map")
+    (tmp_path / "elsewhere").mkdir()
+    save_scen("elsewhere/far.scen", instance, "own.map")
+    torch.manual_seed(0)
+    config = PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=3.0)
+    save(DecentralizedPolicy(config), "policy.safetensors")
+    return tmp_path
+
+
+def played(*arguments):
+    play.main([*arguments, "--run", "policy.safetensors", "--threads", "1"])
+
+
+def shown(path):
+    """The data in a page of replays."""
+    return json.loads(re.findall(r"^const data = (.*);$", path.read_text(encoding="utf-8"), re.MULTILINE)[0])
+
+
+def test_a_scenario_is_played_as_it_stands(home, capsys):
+    played("own.scen", "--max-steps", "30")
+    data, instance = shown(home / "own.html"), load_scen("own.scen")
+    (scene,) = data["scenes"]
+    (panel,) = scene["panels"]
+    assert scene["goals"] == instance.goals.tolist()
+    assert panel["paths"][0] == instance.starts.tolist()
+    assert len(panel["paths"]) == 31
+    assert (data["fov_radius"], data["comm_radius"]) == (2, 3.0)
+    for before, after in zip(panel["paths"], panel["paths"][1:], strict=False):
+        assert not oracles.faults(instance.grid, oracles.cells(before), oracles.cells(after))
+    home_now = sum(cell == goal for cell, goal in zip(panel["paths"][-1], scene["goals"], strict=True))
+    told = capsys.readouterr().out
+    assert f"6 robots on 9 x 12 cells: {home_now} on goal after 30 steps, failed: " in told
+    assert data["title"] in told
+    assert "replay: own.html" in told
+
+
+def test_robots_are_placed_on_a_map_by_the_seed(home):
+    pages = {}
+    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+        played("own.map", "--agents", "4", "--seed", seed, "--max-steps", "5", "--out", f"{name}.html")
+        pages[name] = shown(home / f"{name}.html")
+    assert pages["a"] == pages["b"] != pages["c"]
+    assert len(pages["a"]["scenes"][0]["goals"]) == 4
+
+
+def test_every_option_reaches_the_rollout(home, monkeypatch):
+    asked = []
+    monkeypatch.setattr(play, "rollout", lambda *given, **how: asked.append(how) or rollout(*given, **how))
+    for options in ([], ["--row", "argmax"], ["--row", "sampled,0.5,pibt", "--max-steps", "7"]):
+        played("own.scen", "--seed", "3", *options)
+    instance = load_scen("own.scen")
+    longest = max(
+        oracles.distances(instance.grid, goal)[start]
+        for start, goal in zip(oracles.cells(instance.starts), oracles.cells(instance.goals), strict=True)
+    )
+    rows = [Execution(sample="stuck"), Execution(), Execution(sample=True, temperature=0.5, shield="pibt")]
+    limits = [4 * longest, 4 * longest, 7]
+    assert asked == [{"seed": 3, "max_steps": limit, **asdict(row)} for row, limit in zip(rows, limits, strict=True)]
+
+
+def test_a_scenario_elsewhere_takes_the_first_robots_and_a_map(home):
+    played("elsewhere/far.scen", "--map", "own.map", "--agents", "2", "--max-steps", "3")
+    assert shown(home / "far.html")["scenes"][0]["goals"] == load_scen("own.scen", 2).goals.tolist()
+
+
+def test_a_team_that_is_home_has_solved_it(home, capsys):
+    instance = load_scen("own.scen")
+    save_scen("rest.scen", instance.at(instance.goals), "own.map")
+    played("rest.scen")
+    assert "6 on goal after 0 steps, flowtime 0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("own.map", "give --agents N"),
+        ("own.map --agents 0", "num_agents must be at least 1"),
+        ("own.map --agents 999", "999"),
+        ("own.scen --agents 7", "only 6 entries"),
+        ("own.map --agents 3 --map own.map", "--map goes with a scenario only"),
+        ("own.map --agents 3 --seed -1", "seed"),
+        ("own.map --agents 3 --max-steps 0", "max_steps must be at least 1"),
+        ("own.map --agents 3 --threads -1", "threads"),
+        ("own.map --agents 3 --row best", "unknown word 'best'"),
+        ("own.map --agents 3 --out none/page.html", "none is no folder"),
+        ("own.map --agents 3 --out elsewhere", "elsewhere is a folder"),
+        ("none.map --agents 3", "none.map"),
+        ("none.scen", "none.scen"),
+        ("elsewhere --agents 3", "must be a map"),
+        ("policy.safetensors --agents 3", "must be a map"),
+        ("own.scen --run none", "none"),
+    ],
+)
+def test_a_mistake_takes_one_line(home, capsys, wrong, words):
+    with pytest.raises(SystemExit) as end:
+        play.main(["--run", "policy.safetensors", *wrong.split()])
+    assert end.value.code == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: ")
+    assert told.count("\n") == 1
+    assert words in told
+    assert not list(home.glob("*.html"))
+
+
+def test_the_help_names_every_option(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        play.main(["--help"])
+    text = capsys.readouterr().out
+    for each in fields(play.Command):
+        assert (f"--{each.name.replace('_', '-')}" if each.name != "file" else "FILE") in text, each.name

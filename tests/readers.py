@@ -1,0 +1,98 @@
+"""What every reader of files promises, whatever the bytes: an instance or map, or an error that says where.
+
+Run as a script this is a target for coverage-guided fuzzing, which needs `pip install atheris`:
+    python tests/readers.py -max_total_time=300
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+GRID = [[0, 0, 1, 0], [0, 0, 0, 1], [1, 1, 0, 0]]
+MAP = b"type octile\nheight 3\nwidth 4\nmap\n..@.\nGS.T\nOW..\n"
+SCEN = b"version 1\n0\ta.map\t4\t3\t0\t0\t2\t1\t2.41421356\n1\ta.map\t4\t3\t1\t1\t3\t2\t2.41421356\n"
+
+atheris: Any = importlib.import_module("atheris") if __name__ == "__main__" else None
+with atheris.instrument_imports(include=["mapf_env"]) if atheris else nullcontext():
+    import mapf_env
+
+Reader = Callable[[Path], Any]
+READERS: dict[str, Reader] = {"map": mapf_env.load_map, "scen": mapf_env.load_scen, "json": mapf_env.load_instances}
+WHERE = {
+    "map": r"line \d+",
+    "scen": r"line (\d+|i \+ 2)",
+    "json": r"line \d+ column \d+|(map|instance) \d+|expected|position \d+|recursion|digits",
+}
+"""How the message of an error names the place, for each kind of file."""
+
+
+def samples(folder: Path) -> dict[str, bytes]:
+    """A sound file of each kind."""
+    instance = mapf_env.Instance(GRID, [(0, 0), (1, 1)], [(1, 2), (2, 3)])
+    mapf_env.save_instances(folder / "sample", [instance, instance.at([(1, 0), (0, 1)])])
+    return {"map": MAP, "scen": SCEN, "json": (folder / "sample").read_bytes()}
+
+
+def faults(kind: str, content: bytes, folder: Path) -> list[str]:
+    """What the reader of that kind does with the content that it should not do; `folder` is for the file."""
+    (folder / "a.map").write_bytes(MAP)
+    path = folder / f"read.{kind}"
+    path.write_bytes(content)
+    try:
+        found = READERS[kind](path)
+    except (ValueError, FileNotFoundError) as error:
+        said = str(error)
+        unnamed = [] if str(folder) in said else [f"no file is named: {said}"]
+        return unnamed if re.search(WHERE[kind], said) else [*unnamed, f"no place is named: {said}"]
+    except Exception as error:
+        return [f"{type(error).__name__}: {error}"]
+    return [fault for each in (found if kind == "json" else [found]) for fault in unsound(each)]
+
+
+def unsound(found: Any) -> list[str]:
+    """What is wrong with a map or an instance that a reader has accepted."""
+    if isinstance(found, np.ndarray):
+        return [] if found.dtype == np.bool_ and found.ndim == 2 and found.size else ["this is no map"]
+    if not isinstance(found, mapf_env.Instance):
+        return ["this is no instance"]
+    wrong = unsound(found.grid)
+    for name, cells in (("start", found.starts), ("goal", found.goals)):
+        places = {tuple(cell) for cell in cells.tolist()}
+        height, width = found.grid.shape
+        if len(places) < len(cells) or not all(
+            0 <= row < height and 0 <= col < width and not found.grid[row, col] for row, col in places
+        ):
+            wrong.append(f"a {name} is no cell of its own")
+    return wrong
+
+
+def main() -> None:
+    """Fuzz until told to stop; the first byte chooses the kind of file."""
+    kinds, folder = sorted(READERS), Path(tempfile.mkdtemp(dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
+
+    def test_one_input(data: bytes) -> None:
+        if not data:
+            return
+        found = faults(kinds[data[0] % len(kinds)], data[1:], folder)
+        if found:
+            raise RuntimeError(f"{kinds[data[0] % len(kinds)]}: {found}")
+
+    corpus = Path(tempfile.mkdtemp())
+    for number, (_, content) in enumerate(sorted(samples(folder).items())):
+        (corpus / str(number)).write_bytes(bytes([number]) + content)
+    atheris.Setup([*sys.argv, str(corpus)], test_one_input)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

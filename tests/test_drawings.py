@@ -1,0 +1,33 @@
+"""The drawings of the docs are those of their script, and show what they say."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from gnn_policy.failures import failure
+
+HOME = Path(__file__).parents[1] / "docs" / "drawings"
+spec = importlib.util.spec_from_file_location("draw", HOME / "draw.py")
+assert spec is not None
+assert spec.loader is not None
+draw = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(draw)
+
+
+def test_the_files_are_what_the_script_draws() -> None:
+    drawn = draw.drawings()
+    assert {path.stem for path in HOME.glob("*.svg")} == set(drawn)
+    for name, picture in drawn.items():
+        assert (HOME / f"{name}.svg").read_text(encoding="utf-8") == picture, "run docs/drawings/draw.py"
+
+
+@pytest.mark.parametrize("name", draw.failures())
+def test_a_failure_is_of_its_kind(name: str) -> None:
+    assert failure(*draw.failures()[name]) == name.replace("_", " ")
+
+
+def test_every_drawing_is_shown() -> None:
+    concepts = (HOME.parent / "concepts.md").read_text(encoding="utf-8")
+    for path in HOME.glob("*.svg"):
+        assert f"](drawings/{path.name})" in concepts
