@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from gnn_policy.cases import Split
 from gnn_policy.network import PolicyConfig
@@ -14,7 +14,7 @@ from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
 Recipe = Literal["quick", "full", "paper"]
-Ties = Literal["fixed", "varied"]
+RobotOrder = Literal["index", "random", "farthest", "nearest"]
 Aggregation = Literal["visited", "stuck"]
 
 
@@ -53,8 +53,9 @@ class TrainConfig:
     """Who shows the moves: "ecbs", "lacam", "prioritised", "pibt", or a solver of your own as "module:function"."""
     w: float = 1.05
     """ECBS's cost is at most w times the lower bound of the optimum; its plans also set T_max."""
-    ties: Ties = "fixed"
-    """Among equally good moves the teacher decides by one seed in all states, or by a seed of each state's own."""
+    robot_order: RobotOrder = "index"
+    """The order in which the teacher is given the robots of a state, by which solvers break ties: that of their
+    numbers, "random" in each state, or by the Manhattan distance to their goals, "farthest" or "nearest" first."""
     expert_nodes: int = 2000
     """Nodes that ECBS or LaCAM may generate to label a state; unlabelled states are counted and left out."""
 
@@ -123,6 +124,9 @@ class TrainConfig:
         for name in ("beta_decay", "fresh_share", "beta1"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
+        for name, choices in (("robot_order", get_args(RobotOrder)), ("aggregation", get_args(Aggregation))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
         for name in ("seed", "data_seed"):
             if getattr(self, name) >= 2**64:
                 raise ValueError(f"{name} must be below 2**64, got {getattr(self, name)}")

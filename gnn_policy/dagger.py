@@ -11,8 +11,7 @@ import math
 import pkgutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +21,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 import experts
-from experts.many import SOLVER_NAMES, solver_named
-from gnn_policy.config import Ties, TrainConfig
+from experts.many import SOLVER_NAMES
+from gnn_policy.config import RobotOrder, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.ranks import Ranks
@@ -38,13 +37,13 @@ class Teacher:
         instances: The training cases.
         solver: The expert: one of the solvers that `experts.solve_many` knows by name, or "module:function".
         w: ECBS's bound on suboptimality.
-        ties: Whether a named solver decides ties by one seed in all states, or by a seed that each state makes.
+        robot_order: In which order it is given the robots of a state; it breaks ties by that.
         node_limit: ECBS's and LaCAM's effort for a state.
         threads: CPU threads.
         clock: What `seconds` are measured by.
 
     Raises:
-        ValueError: If there is no such solver, or it cannot be told how to break ties.
+        ValueError: If there is no such solver.
     """
 
     def __init__(
@@ -53,20 +52,15 @@ class Teacher:
         *,
         solver: str = "ecbs",
         w: float,
-        ties: Ties = "fixed",
+        robot_order: RobotOrder = "index",
         node_limit: int,
         threads: int,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._instances, self._name, self._w, self._ties = instances, solver, w, ties
+        self._instances, self._name, self._w, self._robot_order = instances, solver, w, robot_order
         self._node_limit, self._threads, self._clock = node_limit, threads, clock
-        self._solver: str | experts.Solver = solver
-        if solver not in SOLVER_NAMES:
-            self._solver = _own_solver(solver)
-            if ties != "fixed":
-                raise ValueError(f"ties must be 'fixed' with the solver {solver!r}, which breaks them as it likes")
-        elif ties == "varied":
-            self._solver = self._varied
+        self._solver = solver if solver in SOLVER_NAMES else _own_solver(solver)
+        self._goals = np.stack([each.goals for each in instances])
         self.seconds = 0.0
         """Time that it has taken to answer, so far."""
 
@@ -81,27 +75,35 @@ class Teacher:
                 if plan is not None and len(plan.paths) > 1:
                     moves[state] = Solution(plan.paths[:2]).actions[0]
             return moves, np.array([plan is not None for plan in plans], np.bool_)
-        with self._timed():
-            return experts.relabel(
-                [self._instances[i] for i in cases],
-                positions,
-                w=self._w,
-                node_limit=self._node_limit,
-                threads=self._threads,
-            )
+        began = self._clock()
+        order = self._order(cases, positions)
+        instances = [self._instances[i] for i in cases]
+        if self._robot_order != "index":
+            instances, positions = self._ordered(cases, positions, order), _rows(positions, order)
+        moves, solved = experts.relabel(
+            instances, positions, w=self._w, node_limit=self._node_limit, threads=self._threads
+        )
+        moves = _rows(moves, order.argsort(axis=1))
+        self.seconds += self._clock() - began
+        return moves, solved
 
     def plans(self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]) -> list[Solution | None]:
         """The plan from each of M states, or None where the expert found none."""
-        with self._timed():
-            results = experts.solve_many(
-                [self._instances[case].at(state) for case, state in zip(cases, positions, strict=True)],
-                solver=self._solver,
-                w=self._w,
-                threads=self._threads,
-                time_limit=math.inf,
-                node_limit=self._node_limit,
-            )
-        plans = [result.solution for result in results]
+        began = self._clock()
+        order = self._order(cases, positions)
+        results = experts.solve_many(
+            self._ordered(cases, positions, order),
+            solver=self._solver,
+            w=self._w,
+            threads=self._threads,
+            time_limit=math.inf,
+            node_limit=self._node_limit,
+        )
+        plans = [
+            None if result.solution is None else Solution(result.solution.paths[:, back])
+            for result, back in zip(results, order.argsort(axis=1), strict=True)
+        ]
+        self.seconds += self._clock() - began
         for state, plan in zip(positions, plans, strict=True):
             if plan is not None and not np.array_equal(plan.paths[0], state):
                 raise ValueError(
@@ -109,6 +111,28 @@ class Teacher:
                     f"from {state.tolist()}"
                 )
         return plans
+
+    def _order(self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]) -> npt.NDArray[np.intp]:
+        """(M, N) the robots of each state in the order in which the expert is given them, a function of the state."""
+        M, N = positions.shape[:2]
+        if self._robot_order == "index":
+            return np.tile(np.arange(N), (M, 1))
+        if self._robot_order == "random":
+            state = cases.astype(np.uint64)
+            for coordinates in positions.reshape(M, -1).T.astype(np.uint64):
+                state = _native.mix(state, np.ascontiguousarray(coordinates))
+            robots = np.tile(np.arange(N, dtype=np.uint64), M)
+            return _native.mix(np.repeat(state, N), robots).reshape(M, N).argsort(axis=1)
+        distances = np.abs(positions.astype(np.int64) - self._goals[cases]).sum(axis=2)
+        return (distances if self._robot_order == "nearest" else -distances).argsort(axis=1, kind="stable")
+
+    def _ordered(
+        self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer], order: npt.NDArray[np.intp]
+    ) -> list[Instance]:
+        return [
+            Instance(self._instances[case].grid, state[robots], self._goals[case][robots])
+            for case, state, robots in zip(cases, positions, order, strict=True)
+        ]
 
     def demonstrate(
         self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]
@@ -144,18 +168,10 @@ class Teacher:
         )
         return labelled, int((~solved).sum())
 
-    def _varied(self, instance: Instance) -> experts.Result:
-        seed = np.zeros(1, np.uint64)
-        for coordinate in instance.starts.ravel().tolist():
-            seed = _native.mix(seed, np.array([coordinate], np.uint64))
-        solve = solver_named(self._name, w=self._w, time_limit=math.inf, node_limit=self._node_limit, seed=int(seed[0]))
-        return solve(instance)
 
-    @contextmanager
-    def _timed(self) -> Iterator[None]:
-        began = self._clock()
-        yield
-        self.seconds += self._clock() - began
+def _rows(array: npt.NDArray[Any], order: npt.NDArray[np.intp]) -> npt.NDArray[Any]:
+    """(M, N, ...) with the N entries of each row in its own order (M, N)."""
+    return array[np.arange(len(array))[:, None], order]
 
 
 def _own_solver(name: str) -> experts.Solver:

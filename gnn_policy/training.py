@@ -138,7 +138,7 @@ class Training:
             self._instances,
             solver=config.teacher,
             w=config.w,
-            ties=config.ties,
+            robot_order=config.robot_order,
             node_limit=config.expert_nodes,
             threads=self.threads,
             clock=clock,

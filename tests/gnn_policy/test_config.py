@@ -78,6 +78,8 @@ WRONG = {
     "dagger_every": -1,
     "dagger_steps": 0,
     "beta_decay": 1.5,
+    "robot_order": "lowest",
+    "aggregation": "none",
     "fresh_share": -0.1,
     "fresh_window": 0,
     "rollout_length": 0,

@@ -1,6 +1,10 @@
 """Aggregation: states of the mixture, labels of the expert alone."""
 
+import sys
 from dataclasses import replace
+from functools import partial
+from itertools import permutations
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ from gnn_policy.config import TrainConfig
 from gnn_policy.dagger import Aggregator, Mixture, Teacher
 from gnn_policy.demonstrations import BatchMaker
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
+from mapf_env import Instance
 
 STEPS = [(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)]
 CONFIG = TrainConfig(
@@ -44,7 +49,7 @@ def taught_by(cases, **settings):
 
 
 def aggregating(config, policy, cases):
-    teacher = taught_by(cases, solver=config.teacher, ties=config.ties)
+    teacher = taught_by(cases, solver=config.teacher, robot_order=config.robot_order)
     return Aggregator(config, policy, teacher, cases)
 
 
@@ -227,6 +232,163 @@ def test_labels_keep_the_order_of_the_visits(cases):
     states, _ = teacher.label(order, np.stack([cases[i].starts for i in order]))
     assert states.cases.tolist() == order.tolist()
     assert_labels_are_the_experts(cases, states, w=1.05, node_limit=2000)
+
+
+def first_moves(result, num_agents):
+    assert result.solution
+    steps = np.diff(result.solution.paths[:2], axis=0)
+    return [STEPS.index(tuple(step)) for step in steps[0].tolist()] if len(steps) else [4] * num_agents
+
+
+SOLVERS = {
+    "lacam": partial(experts.lacam, node_limit=2000),
+    "prioritised": experts.prioritised,
+    "pibt": experts.pibt,
+    "experts:lacam": experts.lacam,
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("threads", [1, 3])
+def test_any_solver_can_teach_the_first_move_of_its_plan(cases, name, threads):
+    teacher = taught_by(cases, solver=name, threads=threads)
+    order = np.tile(np.arange(len(cases)), 2)
+    halfway = [experts.solve(each).solution.paths for each in cases]
+    positions = np.stack(
+        [each.starts for each in cases] + [paths[len(paths) // 2] for paths in halfway[:-1]] + [cases[-1].goals]
+    )
+    moves, solved = teacher.moves(order, positions)
+    assert solved.all()
+    for case, state, taught in zip(order, positions, moves, strict=True):
+        assert taught.tolist() == first_moves(SOLVERS[name](cases[case].at(state)), 4)
+    assert moves[-1].tolist() == [4] * 4
+    by_ecbs, _ = taught_by(cases).moves(order, positions)
+    assert (moves != by_ecbs).any(), "the cases do not tell this solver from ECBS"
+
+
+def test_a_solver_that_finds_nothing_teaches_nothing():
+    corridor = Instance(np.zeros((1, 4), bool), [(0, 0), (0, 3)], [(0, 3), (0, 0)])
+    for name in ("pibt", "prioritised", "lacam"):
+        teacher = taught_by([corridor], solver=name)
+        states, unsolved = teacher.label(np.zeros(3, int), np.stack([corridor.starts, corridor.goals, corridor.starts]))
+        assert (states.positions.tolist(), unsolved) == ([corridor.goals.tolist()], 2)
+        states, unsolved = teacher.demonstrate(np.zeros(2, int), np.stack([corridor.starts] * 2))
+        assert (len(states), states.positions.shape, states.actions.shape, unsolved) == (0, (0, 2, 2), (0, 2), 2)
+
+
+def test_a_solver_that_answers_another_question_is_found_out(cases, monkeypatch):
+    module = ModuleType("their_solvers")
+    module.stubborn = lambda instance: experts.solve(cases[0])  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setitem(sys.modules, "their_solvers", module)
+    teacher = taught_by(cases, solver="their_solvers:stubborn")
+    assert teacher.moves(np.array([0]), cases[0].starts[None])[1].all()
+    with pytest.raises(ValueError, match="'their_solvers:stubborn' answered with a plan from"):
+        teacher.moves(np.array([0, 1]), np.stack([cases[0].starts, cases[1].starts]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"solver": "cbs"}, "one of ecbs, lacam, prioritised, pibt, or a solver of your own as .*; got 'cbs'"),
+        ({"solver": "no.such.module:solve"}, "'no.such.module:solve' cannot be found: No module"),
+        ({"solver": "experts:oracle"}, "'experts:oracle' cannot be found: .*oracle"),
+        ({"solver": "experts:__all__"}, "'experts:__all__' is no function but list"),
+    ],
+)
+def test_a_teacher_that_cannot_teach_is_refused(cases, settings, message):
+    with pytest.raises(ValueError, match=message):
+        taught_by(cases, **settings)
+
+
+def label_in_order(case, order, **limits):
+    """The label that an expert gives who is told of the robots in this order."""
+    result = experts.solve(Instance(case.grid, case.starts[order], case.goals[order]), **limits)
+    moves = first_moves(result, len(order))
+    return [moves[order.index(robot)] for robot in range(len(order))]
+
+
+@pytest.fixture(scope="module")
+def crowded():
+    return make_cases(
+        "train", seed=5, maps=4, cases_per_map=25, num_agents=4, height=4, width=4, density=0.1, styles=["cells"]
+    )
+
+
+@pytest.mark.parametrize(("robot_order", "sign"), [("index", 0), ("farthest", -1), ("nearest", 1)])
+def test_the_expert_meets_the_robots_in_the_order_asked_for(crowded, robot_order, sign):
+    which, positions = np.arange(len(crowded)), np.stack([each.starts for each in crowded])
+    teacher = taught_by(crowded, robot_order=robot_order, node_limit=500)
+    moves, solved = teacher.moves(which, positions)
+    assert solved.all()
+    orders = []
+    for case, taught, plan in zip(crowded, moves, teacher.plans(which, positions), strict=True):
+        ways = [abs(r - y) + abs(c - x) for (r, c), (y, x) in zip(case.starts, case.goals, strict=True)]
+        orders.append(sorted(range(4), key=lambda robot: (sign * ways[robot], robot)))
+        assert taught.tolist() == label_in_order(case, orders[-1], node_limit=500)
+        assert not plan.violations(case)
+        assert plan.actions[0].tolist() == taught.tolist()
+    by_number, _ = taught_by(crowded, node_limit=500).moves(which, positions)
+    assert (moves != by_number).any() == (robot_order != "index"), "the cases do not tell the orders apart"
+
+
+def test_a_random_order_is_a_function_of_the_state(crowded):
+    which, positions = np.arange(len(crowded)), np.stack([each.starts for each in crowded])
+    moves, _ = taught_by(crowded, robot_order="random", node_limit=500).moves(which, positions)
+    again, _ = taught_by(crowded, robot_order="random", node_limit=500, threads=2).moves(which[::-1], positions[::-1])
+    assert np.array_equal(again[::-1], moves)
+    orders = [list(each) for each in permutations(range(4))]
+    told_apart = []
+    for case, taught in zip(crowded[:30], moves, strict=False):
+        labels = [label_in_order(case, order, node_limit=500) for order in orders]
+        assert taught.tolist() in labels
+        if labels[0] != labels[-1]:
+            told_apart.append(taught.tolist() == labels[0])
+    assert 0.1 < np.mean(told_apart) < 0.9
+
+
+def test_the_teacher_says_how_long_it_took(cases):
+    times = iter(range(0, 1000, 5))
+    teacher = taught_by(cases, solver="pibt", clock=lambda: next(times))
+    for asked in (1, 2, 3):
+        teacher.moves(np.array([0]), cases[0].starts[None])
+        assert teacher.seconds == 5 * asked
+
+
+def test_plans_from_where_teams_are_stuck(cases, policy):
+    """Which teams those are is read from all states of the same rollouts: they never began another case."""
+    with torch.no_grad():
+        policy.head.weight.zero_()
+        policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))  # this policy always stays
+    teams, length, batches = CONFIG.rollout_teams, 10, 6
+    config = replace(CONFIG, beta_decay=0.6, rollout_length=length, seed=3)
+    steps = teams * length * batches
+    visited, _ = collected(config, policy, cases, 1, steps)
+    stuck, unsolved = collected(replace(config, aggregation="stuck"), policy, cases, 1, steps)
+    assert unsolved == 0
+    following, failed = 0, 0
+    for team in range(teams * batches):
+        own = slice(team * length, (team + 1) * length)
+        (case, *others), last = visited.cases[own], visited.positions[own][-1].astype(int)
+        if any(other != case for other in others):
+            continue
+        plan = experts.solve(cases[case].at(last), w=config.w, node_limit=config.expert_nodes).solution.paths
+        block = slice(following, following + len(plan) - 1)
+        if len(plan) == 2 and not np.array_equal(stuck.positions[block], plan[:1]):
+            continue  # it arrived with its last step
+        assert set(stuck.cases[block]) == {case}
+        assert np.array_equal(stuck.positions[block], plan[:-1])
+        assert np.array_equal(after(stuck.positions[block], stuck.actions[block]), plan[1:])
+        following, failed = block.stop, failed + 1
+    assert following == len(stuck)
+    assert 3 < failed < teams * batches - 3, "too few teams are stuck, or too few are not"
+
+
+def test_round_zero_imitates_whatever_is_aggregated_later(cases, policy):
+    both = [
+        collected(replace(CONFIG, aggregation=each), policy, cases, 0, 100)[0].positions
+        for each in ("visited", "stuck")
+    ]
+    assert np.array_equal(*both)
 
 
 def test_the_mixture_reads_what_the_environment_writes(policy, cases):

@@ -1,5 +1,6 @@
 """Training: a function of its settings, whatever happens to the process that runs it."""
 
+import contextlib
 import csv
 import math
 import multiprocessing
@@ -97,7 +98,20 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
     assert not torch.equal(weights(run)["head.weight"], weights(other)["head.weight"])
 
 
-def test_a_run_stopped_after_any_round_goes_on_to_the_same_end(run, tmp_path):
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"teacher": "pibt", "robot_order": "random", "beta_decay": 0.5},
+        {"aggregation": "stuck", "teacher": "experts:lacam"},
+    ],
+)
+def test_a_run_stopped_after_any_round_goes_on_to_the_same_end(run, tmp_path, settings):
+    config = replace(CONFIG, **settings)
+    if settings:
+        run = trained(config, tmp_path / "whole")
+    assert all(row.demonstrations for row in run.history)
+
     class StopError(Exception):
         pass
 
@@ -107,8 +121,8 @@ def test_a_run_stopped_after_any_round_goes_on_to_the_same_end(run, tmp_path):
     folder = tmp_path / "run"
     for _ in range(CONFIG.epochs):
         with pytest.raises(StopError):
-            trained(CONFIG, folder, stop)
-    resumed = trained(CONFIG, folder)
+            trained(config, folder, stop)
+    resumed = trained(config, folder)
     assert_equal_weights(weights(run), weights(resumed))
     assert metrics(run.folder) == metrics(folder)
     assert timeless(map(asdict, run.history)) == timeless(map(asdict, resumed.history))
@@ -126,6 +140,42 @@ def test_the_rows_count_updates_samples_and_states(run):
         assert row.demonstrations == sum(map(len, expected))
         assert (row.validation_success is None) == (number == 0)
     assert [row.seconds for row in run.history] == sorted(row.seconds for row in run.history)
+
+
+def test_seconds_are_those_of_the_clock(tmp_path, monkeypatch):
+    now = [0.0]
+
+    def slow(function, seconds):
+        def slowed(*arguments, **options):
+            now[0] += seconds
+            return function(*arguments, **options)
+
+        return slowed
+
+    class StopError(Exception):
+        pass
+
+    def stop(row):
+        raise StopError
+
+    monkeypatch.setattr("experts.relabel", slow(training.evaluation.experts.relabel, 7))
+    monkeypatch.setattr(Demonstrations, "save", slow(Demonstrations.save, 2))
+    monkeypatch.setattr(BatchMaker, "batch", slow(BatchMaker.batch, 1))
+    monkeypatch.setattr(training, "rollout", slow(rollout, 50))
+    for listener in (stop, lambda row: None):
+        run = Training(CONFIG, tmp_path / "run", Silence(listener), clock=lambda: now[0])
+        now[0] += 1000 if listener is stop else 0  # before the rounds
+        with contextlib.suppress(StopError):
+            run.run()
+    rows = run.history
+    for row in rows:
+        labelled = 7 if row.round else 7 * (CONFIG.demonstration_steps // CONFIG.rollout_teams + 1)
+        assert (row.expert_seconds, row.collect_seconds, row.fit_seconds) == (labelled, labelled + 2, 3)
+    spent = [row.collect_seconds + row.fit_seconds for row in rows]
+    asked_as_a_collector_starts = 7
+    first = 1000 + asked_as_a_collector_starts + spent[0]
+    second = first + asked_as_a_collector_starts + spent[1] + 50
+    assert [row.seconds for row in rows] == [first, second, second + spent[2] + 50]
 
 
 def test_the_learning_rate_falls_along_a_cosine(run, tmp_path):
@@ -276,6 +326,7 @@ def test_settings_that_do_not_fit_leave_no_folder_behind(tmp_path):
         replace(CONFIG, density=0.99),
         replace(CONFIG, num_agents=40),
         replace(CONFIG, device="abacus"),
+        replace(CONFIG, teacher="nobody"),
         replace(CONFIG, policy=PolicyConfig(encoder="released", fov_radius=2)),
     ):
         with pytest.raises(ValueError, match=r"\w+ \w+"):
