@@ -26,9 +26,8 @@ from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.dagger import Teacher
 from gnn_policy.evaluation import Estimate, Exam
 from gnn_policy.progress import TrainingProgress
-from gnn_policy.rollout import Cases, rollout
+from gnn_policy.rollout import Teams, rollout
 from gnn_policy.training import Training, split_cases
-from mapf_env import rules
 from mapf_env.files import replacing, write_whole
 
 Variants = dict[str, dict[str, Any]]
@@ -173,17 +172,15 @@ def the_exam() -> Exam:
 class TeacherActor:
     """Asks the teacher anew in every state and does what it says."""
 
-    border = 1
+    border, memory = 1, 0
 
     def __init__(self, teacher: Teacher) -> None:
         self.teacher, self.states = teacher, 0
 
-    def act(
-        self, cases: Cases, obstacles: rules.Bordered, positions: rules.Positions, goals: rules.Positions, time: int
-    ) -> npt.NDArray[np.int8]:
+    def act(self, teams: Teams) -> npt.NDArray[np.int8]:
         """The labels (B, N)."""
-        self.states += len(cases)
-        return self.teacher.moves(cases, positions)[0]
+        self.states += len(teams.cases)
+        return self.teacher.moves(teams.cases, teams.positions)[0]
 
 
 def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:

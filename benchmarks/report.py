@@ -163,7 +163,7 @@ def against_robots(runs: Sequence[Run]) -> str:
 def heat_maps(runs: Sequence[Run]) -> str:
     """Success of the first way of execution, training teams by test teams, and the paper's."""
     ours = {run.trained_on: dict(run.estimates(run.rows()[0], "success_rate")) for run in runs}
-    paper = {size: {int(N): value for N, value in zip(TEAMS, row, strict=True)} for size, row in PAPER.items()}
+    paper: dict[int, dict[int, float]] = {size: dict(zip(TEAMS, row, strict=True)) for size, row in PAPER.items()}
     columns = sorted({size for row in (*ours.values(), *paper.values()) for size in row})
     sizes = sorted({*ours, *paper})
     return side_by_side(

@@ -1,8 +1,9 @@
 """Agent-steps a CPU second on one thread, our environment beside POGEMA's in one run.
 
 Same team sizes, map size, density, radius of view and kind of actions (uniform, drawn beforehand); ours delivers the
-communication graph as well. The competitors take turns, so that a slower spell of the machine hits both. POGEMA lives
-in a virtual environment of its own, because it pins old packages; it is made on the first run.
+communication graph as well. A bare C++ loop that writes the same bytes says what this machine can do. The competitors
+take turns, so that a slower spell of the machine hits all. POGEMA lives in a virtual environment of its own, because it
+pins old packages; it is made on the first run.
 """
 
 from __future__ import annotations
@@ -59,6 +60,8 @@ class Options:
     """Share of obstacles."""
     fov_radius: int = 4
     """Cells seen in each direction (POGEMA's obs_radius)."""
+    parts: tuple[Literal["peers", "threads"], ...] = ("peers", "threads")
+    """The tables to measure: everyone beside POGEMA and the bare loop; two threads and a large team."""
     pogema: bool = True
     """Measure POGEMA as well."""
 
@@ -96,15 +99,18 @@ class Competitor:
     measure: Callable[[int], Rates]
     beside: str
     """The competitor of which it is a multiple."""
+    bare: str = ""
+    """The bare loop that writes the same bytes, of which it is a share."""
 
 
 def calls_per_second(call: Callable[[], object], seconds: float) -> float:
-    """How often `call` runs in a CPU second."""
+    """How often `call` runs in a CPU second; the clock, as slow as a short call, is read after every 16th."""
     call()
     calls, began = 0, time.process_time()
     while time.process_time() - began < seconds:
-        call()
-        calls += 1
+        for _ in range(16):
+            call()
+        calls += 16
     return calls / (time.process_time() - began)
 
 
@@ -143,52 +149,83 @@ def pettingzoo_view(options: Options, **settings: Any) -> Callable[[int], Rates]
     return measure
 
 
-def bare_loop(options: Options, dtype: Dtype, program: Path) -> Callable[[int], Rates]:
-    """The bare C++ loop, which has no resets; it is written for the paper's radius of 4."""
+def bare_loop(
+    options: Options, dtype: Dtype, program: Path, kind: Literal["views", "stores"] = "views", threads: int = 1
+) -> Callable[[int], Rates]:
+    """The bare C++ loop, or its stores alone; it has no resets and is written for the paper's radius of 4."""
 
     def measure(num_agents: int) -> Rates:
         sizes = options.num_envs(num_agents), num_agents, options.size, options.density, options.seconds
-        done = subprocess.run([str(program), *map(str, sizes), dtype], capture_output=True, text=True, check=True)
+        arguments = [*map(str, sizes), dtype, kind, str(threads)]
+        done = subprocess.run([str(program), *arguments], capture_output=True, text=True, check=True)
         return Rates(float(done.stdout), float("nan"))
 
     return measure
 
 
 def compiled_bare_loop() -> Path:
-    """The program, compiled anew; raises CalledProcessError or OSError where there is no compiler."""
+    """The program, compiled anew for this processor.
+
+    Raises:
+        CalledProcessError: If it does not compile.
+        OSError: If there is no compiler.
+    """
     program = PEER_VENV.parent / "bare_loop"
     program.parent.mkdir(exist_ok=True)
     source = str(ROOT / "benchmarks" / "bare_loop.cpp")
-    subprocess.run(["c++", "-O3", "-std=c++20", source, "-o", str(program)], capture_output=True, text=True, check=True)
+    flags = ["-O3", "-march=native", "-std=c++20", "-pthread"]
+    subprocess.run(["c++", *flags, source, "-o", str(program)], capture_output=True, text=True, check=True)
     return program
 
 
-def threads_table(options: Options) -> Table:
-    """Wall-clock rates: two threads beside one, and a thousand robots on a large map beside the largest team."""
+def threads_table(options: Options, program: Path | None) -> Table:
+    """Two threads beside one, by wall-clock time, and a thousand robots on a large map beside the largest team.
 
-    def rate(num_agents: int, num_envs: int, **settings: Any) -> float:
+    The environments take turns of some milliseconds, and the best turn of each counts. A worker sleeps while it is not
+    its environment's turn; short turns would measure how it is woken.
+    """
+    turn_steps = 128
+    largest = max(options.num_agents)
+
+    def stepper(num_agents: int, num_envs: int, **settings: Any) -> Callable[[], float]:
         env = mapf_env.BatchedEnv(num_envs, **(options.settings(num_agents) | settings))
         env.reset(seed=0)
         actions = cycle(np.random.default_rng(0).integers(0, 5, (16, num_envs, num_agents)))
-        out, best = env.buffers(), 0.0
-        for _ in range(options.rounds):
-            calls, began = 0, time.perf_counter()
-            while time.perf_counter() - began < options.seconds:
-                env.step(next(actions), out=out)
-                calls += 1
-            best = max(best, calls * num_envs * num_agents / (time.perf_counter() - began))
-        return best
+        out = env.buffers()
 
-    largest = max(options.num_agents)
-    result = Table(title="agent-steps per second of wall-clock time, best round, float32", box=box.SIMPLE_HEAD)
-    for name in ("", "agent-steps", "ratio"):
+        def turn() -> float:
+            began = time.perf_counter()
+            for _ in range(turn_steps):
+                env.step(next(actions), out=out)
+            return turn_steps * num_envs * num_agents / (time.perf_counter() - began)
+
+        return turn
+
+    def best(*turns: Callable[[], float]) -> list[float]:
+        rates, began = [0.0] * len(turns), time.perf_counter()
+        while time.perf_counter() - began < len(turns) * options.rounds * options.seconds:
+            rates = [max(rate, turn()) for rate, turn in zip(rates, turns, strict=True)]
+        return rates
+
+    result = Table(title="agent-steps per second, best turns, float32, caller's memory", box=box.SIMPLE_HEAD)
+    for name in ("", "one thread", "two threads", "ratio"):
         result.add_column(name, justify="right" if name else "left", no_wrap=True)
-    num_envs = 4 * options.num_envs(largest)
-    one, two = (rate(largest, num_envs, threads=threads) for threads in (1, 2))
-    thousand = rate(1000, 1, height=256, width=256)
-    result.add_row(f"N={largest}, one thread", f"{one:,.0f}", "")
-    result.add_row(f"N={largest}, two threads", f"{two:,.0f}", f"{two / one:.2f}x")
-    result.add_row("N=1000 on 256x256, one thread", f"{thousand:,.0f}", f"{thousand / one:.2f}x")
+    for num_agents in options.num_agents:
+        num_envs = 4 * options.num_envs(num_agents)
+        one, two = best(*(stepper(num_agents, num_envs, threads=threads) for threads in (1, 2)))
+        name = f"N={num_agents}, {num_envs} environments"
+        result.add_row(name, f"{one:,.0f}", f"{two:,.0f}", f"{two / one:.2f}x")
+    kinds: tuple[tuple[str, Literal["views", "stores"]], ...] = (("bare loop", "views"), ("its stores alone", "stores"))
+    for name, kind in kinds if program else ():
+        rates = [[0.0], [0.0]]
+        for _ in range(options.rounds):
+            for threads in (1, 2):
+                measure = bare_loop(options, "float32", program, kind, threads)  # pyright: ignore[reportArgumentType]
+                rates[threads - 1].append(measure(largest).agent_steps)
+        one, two = map(max, rates)
+        result.add_row(f"{name}, N={largest}", f"{one:,.0f}", f"{two:,.0f}", f"{two / one:.2f}x")
+    one, thousand = best(stepper(largest, options.num_envs(largest)), stepper(1000, 1, height=256, width=256))
+    result.add_row(f"N=1000 on 256x256 beside N={largest}", f"{thousand:,.0f}", "", f"{thousand / one:.2f}x")
     return result
 
 
@@ -229,26 +266,26 @@ def peer_python() -> Path:
     return python
 
 
-def competitors(options: Options, console: Console) -> list[Competitor]:
+def competitors(options: Options, console: Console, program: Path | None) -> list[Competitor]:
     """Who takes part; ours only, with a warning, if POGEMA cannot be installed."""
-    peer = "POGEMA, list API"
+    peer, view = "POGEMA, list API", "POGEMA, PettingZoo"
+    floats, ints = ("bare loop, float32", "bare loop, uint8") if program else ("", "")
     ours = [
-        Competitor("BatchedEnv, float32", batched(options), peer),
-        Competitor("float32, caller's memory", batched(options, own_memory=True), peer),
-        Competitor("BatchedEnv, uint8", batched(options, "uint8"), peer),
-        Competitor("uint8, caller's memory", batched(options, "uint8", own_memory=True), peer),
+        Competitor("BatchedEnv, float32", batched(options), peer, floats),
+        Competitor("float32, caller's memory", batched(options, own_memory=True), peer, floats),
+        Competitor("BatchedEnv, uint8", batched(options, "uint8"), peer, ints),
+        Competitor("uint8, caller's memory", batched(options, "uint8", own_memory=True), peer, ints),
         Competitor("float32 + cost-to-go", batched(options, extra_channels=("cost_to_go",)), peer),
-        Competitor("float32 + PIBT shield", batched(options, shield="pibt"), peer),
-        Competitor("float32 + message loss 10%", batched(options, message_loss=0.1), peer),
-        Competitor("float32 + lifelong", batched(options, task="lifelong"), peer),
-        Competitor("PettingZoo, fresh observations", pettingzoo_view(options), "POGEMA, PettingZoo"),
-        Competitor("PettingZoo, reused buffers", pettingzoo_view(options, reuse_buffers=True), "POGEMA, PettingZoo"),
+        Competitor("float32 + PIBT shield", batched(options, shield="pibt"), peer, floats),
+        Competitor("float32 + message loss 10%", batched(options, message_loss=0.1), peer, floats),
+        Competitor("float32 + lifelong", batched(options, task="lifelong"), peer, floats),
+        Competitor("PettingZoo, fresh observations", pettingzoo_view(options), view, floats),
+        Competitor("PettingZoo, reused buffers", pettingzoo_view(options, reuse_buffers=True), view, floats),
     ]
-    try:
-        program = compiled_bare_loop()
-        ours += [Competitor(f"bare loop, {dtype}", bare_loop(options, dtype, program), peer) for dtype in DTYPES]
-    except (subprocess.CalledProcessError, OSError) as error:
-        console.print(f"[bold red]The bare loop is not measured: {error}[/]")
+    if program:
+        for dtype, name in zip(DTYPES, (floats, ints), strict=True):
+            ours.append(Competitor(name, bare_loop(options, dtype, program), peer, name))
+            ours.append(Competitor(f"bare stores, {dtype}", bare_loop(options, dtype, program, "stores"), peer, name))
     if not options.pogema:
         return ours
     try:
@@ -259,9 +296,9 @@ def competitors(options: Options, console: Console) -> list[Competitor]:
         console.print(f"[bold red]POGEMA is not measured: {PEER} could not be installed.[/]\n{reason}")
         return ours
     return [
-        Competitor("POGEMA, list API", pogema(options, "list", python), "POGEMA, list API"),
+        Competitor(peer, pogema(options, "list", python), peer),
         *ours,
-        Competitor("POGEMA, PettingZoo", pogema(options, "pettingzoo", python), "POGEMA, PettingZoo"),
+        Competitor(view, pogema(options, "pettingzoo", python), view),
     ]
 
 
@@ -274,17 +311,19 @@ def table(
         rates = measured.get((name, num_agents))
         return statistics.median(getattr(rate, field) for rate in rates) if rates else None
 
+    shares = field == "agent_steps"
     result = Table(title=title, box=box.SIMPLE_HEAD)
-    result.add_column("")
+    result.add_column("", no_wrap=True)
     for num_agents in options.num_agents:
-        result.add_column(f"N={num_agents}", justify="right", no_wrap=True)
-        result.add_column("ratio", justify="right", no_wrap=True)
+        for name in (f"N={num_agents}", "ratio", *(["bare"] if shares else [])):
+            result.add_column(name, justify="right", no_wrap=True)
     for one in everyone:
         cells: list[str] = []
         for num_agents in options.num_agents:
-            value, peer = median(one.name, num_agents), median(one.beside, num_agents)
+            value, peer, bare = (median(name, num_agents) for name in (one.name, one.beside, one.bare))
             cells += [f"{value:,.0f}", f"{value / peer:.1f}x" if peer else ""] if value else ["", ""]
-        if field != "resets" or not one.name.startswith("bare"):
+            cells += [f"{value / bare:.2f}" if value and bare else ""] if shares else []
+        if shares or not one.name.startswith("bare"):
             result.add_row(one.name, *cells)
     return result
 
@@ -308,23 +347,32 @@ def cpu_name() -> str:
 
 def main(options: Options) -> int:
     """Measure everyone in turns and print medians."""
-    console = Console(width=max(Console().width, 110))
-    everyone = competitors(options, console)
-    measured: dict[tuple[str, int], list[Rates]] = defaultdict(list)
-    with Progress(console=Console(stderr=True)) as progress:
-        bar = progress.add_task("rounds", total=options.rounds * len(options.num_agents) * len(everyone))
-        for _ in range(options.rounds):
-            for num_agents in options.num_agents:
-                for one in everyone:
-                    measured[one.name, num_agents].append(one.measure(num_agents))
-                    progress.advance(bar)
+    console = Console(width=max(Console().width, 130))
+    program = None
+    try:
+        program = compiled_bare_loop()
+    except (subprocess.CalledProcessError, OSError) as error:
+        reason = str(getattr(error, "stderr", None) or error).strip()
+        console.print(f"[bold red]The bare loop is not measured: it could not be compiled.[/]\n{reason}")
     maps = f"{options.size}x{options.size}, density {options.density}, radius {options.fov_radius}"
-    batch = f"BatchedEnv: {options.robots_at_once} robots at once, graph included"
     console.print(provenance())
-    console.print(f"{maps}; one thread; {batch}; medians of {options.rounds} rounds, per CPU second")
-    for title, field in (("agent-steps", "agent_steps"), ("resets with a new random instance", "resets")):
-        console.print(table(title, field, everyone, measured, options))
-    console.print(threads_table(options))
+    if "peers" in options.parts:
+        everyone = competitors(options, console, program)
+        measured: dict[tuple[str, int], list[Rates]] = defaultdict(list)
+        with Progress(console=Console(stderr=True)) as progress:
+            bar = progress.add_task("rounds", total=options.rounds * len(options.num_agents) * len(everyone))
+            for _ in range(options.rounds):
+                for num_agents in options.num_agents:
+                    for one in everyone:
+                        measured[one.name, num_agents].append(one.measure(num_agents))
+                        progress.advance(bar)
+        batch = f"BatchedEnv: {options.robots_at_once} robots at once, graph included"
+        console.print(f"{maps}; one thread; {batch}; medians of {options.rounds} rounds, per CPU second")
+        console.print('"ratio": times POGEMA; "bare": share of the bare loop that writes the same bytes')
+        for title, field in (("agent-steps", "agent_steps"), ("resets with a new random instance", "resets")):
+            console.print(table(title, field, everyone, measured, options))
+    if "threads" in options.parts:
+        console.print(threads_table(options, program))
     return 0
 
 

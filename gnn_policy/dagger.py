@@ -12,6 +12,7 @@ import pkgutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from experts.many import SOLVER_NAMES, solver_named
 from gnn_policy.config import Ties, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.ranks import Ranks
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
 from mapf_env import Action, Instance, Solution, _native
 
@@ -144,8 +146,8 @@ class Teacher:
 
     def _varied(self, instance: Instance) -> experts.Result:
         seed = np.zeros(1, np.uint64)
-        for coordinate in instance.starts.ravel().astype(np.uint64):
-            seed = _native.mix(seed, coordinate[None])
+        for coordinate in instance.starts.ravel().tolist():
+            seed = _native.mix(seed, np.array([coordinate], np.uint64))
         solve = solver_named(self._name, w=self._w, time_limit=math.inf, node_limit=self._node_limit, seed=int(seed[0]))
         return solve(instance)
 
@@ -166,7 +168,7 @@ def _own_solver(name: str) -> experts.Solver:
         raise ValueError(f"{wanted}; {name!r} cannot be found: {missing}") from None
     if not callable(solver):
         raise ValueError(f"{wanted}; {name!r} is no function but {type(solver).__name__}")
-    return solver
+    return cast(experts.Solver, solver)
 
 
 class Mixture(TensorDictModuleBase):
@@ -205,12 +207,18 @@ class Aggregator:
     """Collects demonstrations round by round through a TorchRL collector."""
 
     def __init__(
-        self, config: TrainConfig, policy: DecentralizedPolicy, teacher: Teacher, instances: Sequence[Instance]
-    ):
-        self._config, self._teacher = config, teacher
+        self,
+        config: TrainConfig,
+        policy: DecentralizedPolicy,
+        teacher: Teacher,
+        instances: Sequence[Instance],
+        ranks: Ranks = Ranks(),
+    ) -> None:
+        self._config, self._teacher, self._rank = config, teacher, ranks.rank
+        self._teams = ranks.share("rollout_teams", config.rollout_teams)
         self._mixture = Mixture(policy, teacher, sample=config.sample_rollouts)
         self._env = TeamEnv(
-            config.rollout_teams,
+            self._teams,
             instances,
             fov_radius=config.policy.fov_radius,
             extra_channels=("cost_to_go",) if config.policy.cost_to_go else (),
@@ -223,7 +231,7 @@ class Aggregator:
         self._collector = Collector(
             self._env,
             self._mixture,
-            frames_per_batch=config.rollout_teams * config.rollout_length,
+            frames_per_batch=self._teams * config.rollout_length,
             reset_at_each_iter=True,
             compact_obs=True,
             trust_policy=True,
@@ -232,13 +240,15 @@ class Aggregator:
         self._batches: Iterator[TensorDictBase] = iter(self._collector)
 
     def collect(self, round_number: int, steps: int) -> tuple[Demonstrations, int]:
-        """Play at least `steps` team steps and label them; what a round yields depends on its number and the weights.
+        """Play this process's share of at least `steps` team steps and label them.
+
+        What a round yields depends on its number, the process's and the weights.
 
         Returns:
             The demonstrations of all states of the round, or of plans from where teams were stuck, and the number of
             states that the expert could not solve.
         """
-        seed = int(np.random.SeedSequence([self._config.seed, round_number]).generate_state(1)[0])
+        seed = int(np.random.SeedSequence([self._config.seed, round_number, self._rank]).generate_state(1)[0])
         self._env.set_seed(seed)
         self._mixture.random.manual_seed(seed)
         self._mixture.beta = self._config.beta_decay**round_number

@@ -141,7 +141,7 @@ def is_stuck(positions: Positions, goals: Positions, past: Positions) -> npt.NDA
 
 def hears_of(stuck: npt.NDArray[np.bool_], graph: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     """(B, N) who hears of a stuck robot (B, N) over the graph (B, N, N): one bit in the first message of a step."""
-    return ((graph > 0) & stuck[:, None, :]).any(-1)
+    return np.any((graph > 0) & stuck[:, None, :], axis=-1)
 
 
 def robot_seeds(seeds: Seeds, num_agents: int) -> Seeds:

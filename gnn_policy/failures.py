@@ -64,7 +64,7 @@ def _cut_off(
     """Whether no way leads from the cell to the goal around the robots that rest on their goals."""
     blocked = instance.grid.copy()
     blocked[tuple(instance.goals[resting].T)] = True
-    return bool(_native.distances(blocked, goal[None])[0, cell[0], cell[1]] < 0)
+    return bool(_native.distances(blocked, goal[None].astype(np.int32))[0, cell[0], cell[1]] < 0)
 
 
 def count_failures(played: Rollouts) -> dict[Failure, int]:

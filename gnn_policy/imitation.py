@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 from torchrl.objectives import LossModule
 
 from gnn_policy.demonstrations import EXPERT_ACTION
-from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.team_env import FOV, GRAPH
 
 
@@ -18,7 +18,7 @@ class ImitationLoss(LossModule):
     categorical multi-agent actors.
     """
 
-    def __init__(self, policy: DecentralizedPolicy) -> None:
+    def __init__(self, policy: nn.Module) -> None:
         super().__init__()
         self.policy = policy
         self.in_keys = [FOV, GRAPH, EXPERT_ACTION]  # pyright: ignore[reportAttributeAccessIssue]

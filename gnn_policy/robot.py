@@ -76,6 +76,11 @@ class Robot:
         """How many messages it sends in a step: K - 1."""
         return self._policy.config.taps - 1
 
+    @property
+    def links(self) -> Mapping[Hashable, float]:
+        """The neighbours that it hears in this step and the weights of their links."""
+        return self._links
+
     def begin(self, view: npt.NDArray[Any], links: Mapping[Hashable, float], cell: tuple[int, int]) -> None:
         """Start a step.
 
@@ -107,7 +112,7 @@ class Robot:
             raise RuntimeError(f"there are {self.rounds} rounds in a step: begin() the next step or act()")
         return Message(self._scaled(self._gathered[-1]), self._stuck)
 
-    def hear(self, messages: Mapping[Hashable, Message]) -> None:
+    def hear(self, messages: Mapping[Any, Message]) -> None:
         """Take the messages that the neighbours sent in this round.
 
         Raises:

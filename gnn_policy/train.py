@@ -15,6 +15,7 @@ from gnn_policy import checkpoint
 from gnn_policy.command_line import mistakes_in_one_line
 from gnn_policy.config import RECIPES, Recipe, TrainConfig
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.ranks import Ranks, join_ranks
 from gnn_policy.results import examine
 from gnn_policy.training import Training
 
@@ -23,7 +24,8 @@ from gnn_policy.training import Training
 class Command:
     """Train a decentralized policy by imitating an ECBS expert, then examine it on held-out maps.
 
-    A killed run goes on where it stopped when the same command is given again.
+    A killed run goes on where it stopped when the same command is given again. Several processes share the work, on one
+    machine or more, when torchrun starts them: `torchrun --nproc-per-node 2 -m gnn_policy.train -- --run runs/two`.
     """
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
@@ -48,15 +50,15 @@ def parse(arguments: Sequence[str]) -> Command:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
-    console = Console()
     with mistakes_in_one_line():
         command = parse(sys.argv[1:] if arguments is None else arguments)
-        _train(command.config, command.run or Path("runs", command.recipe), console)
+        with join_ranks() as ranks:
+            _train(command.config, command.run or Path("runs", command.recipe), Console(quiet=ranks.rank > 0), ranks)
 
 
-def _train(config: TrainConfig, folder: Path, console: Console) -> None:
+def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) -> None:
     progress = TrainingProgress(config.epochs, console)
-    training = Training(config, folder, progress)
+    training = Training(config, folder, progress, ranks)
     console.print(f"run folder: {folder}", highlight=False)
     if training.history:
         console.print(f"goes on after round {len(training.history)} of {config.epochs}", highlight=False)
@@ -66,6 +68,8 @@ def _train(config: TrainConfig, folder: Path, console: Console) -> None:
     except KeyboardInterrupt:
         console.print(f"stopped; the same command goes on after round {len(training.history)}", highlight=False)
         raise SystemExit(130) from None
+    if ranks.rank > 0:
+        return
     examine(checkpoint.load(folder), config, folder, console, threads=training.threads)
     console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
     console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)

@@ -9,6 +9,10 @@ A run folder holds
     learning_curve.png           their picture
 A round is a function of the settings, its number and the state before it: a run that was killed and resumed ends
 exactly like one that was not.
+
+Under torchrun several processes train together: each plays and labels its share of the teams of a round, all of them
+hold all demonstrations, and each fits its share of every batch, whose gradients are averaged. The first alone reads
+and writes the run folder and validates.
 """
 
 from __future__ import annotations
@@ -36,6 +40,7 @@ from gnn_policy.imitation import ImitationLoss
 from gnn_policy.learning_curve import Round, draw_learning_curve
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.ranks import Ranks
 from gnn_policy.rollout import rollout
 from mapf_env import Instance
 from mapf_env.files import remove_drafts, replacing
@@ -105,14 +110,17 @@ class Training:
         config: TrainConfig,
         folder: Path,
         progress: TrainingProgress,
+        ranks: Ranks = Ranks(),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.config, self.folder, self.progress = config, folder, progress
-        self.threads = cpu_threads(config.threads)
+        self.config, self.folder, self.progress, self.ranks = config, folder, progress, ranks
+        ranks.share("batch_size", config.batch_size)
+        ranks.share("rollout_teams", config.rollout_teams)
+        self.threads = config.threads or max(cpu_threads(0) // ranks.local_count, 1)
         torch.set_num_threads(self.threads)
         torch.manual_seed(config.seed)
         self.policy = _on_device(DecentralizedPolicy(config.policy), config.device)
-        self.loss = ImitationLoss(self.policy)
+        self.loss = ImitationLoss(ranks.average_gradients(self.policy))
         self.optimizer = torch.optim.Adam(
             self.policy.parameters(),
             lr=config.lr,
@@ -135,41 +143,57 @@ class Training:
             threads=self.threads,
             clock=clock,
         )
-        open_run(folder, config)
-        (folder / "demonstrations").mkdir(exist_ok=True)
-        if (folder / "state.pt").exists():
-            self._restore()
-        self._shards = [Demonstrations.load(self._shard(r)) for r in range(len(self.history)) if self._collects(r)]
+        self._shards: list[Demonstrations] = []
+        found: dict[str, Any] | None = None
+        if ranks.rank == 0:
+            open_run(folder, config)
+            (folder / "demonstrations").mkdir(exist_ok=True)
+            found = self._read_state()
+        found = ranks.from_first(found)
+        if found is not None:
+            self._restore(found)
+        if ranks.rank == 0:
+            self._shards = [Demonstrations.load(self._shard(r)) for r in range(len(self.history)) if self._collects(r)]
+        self._shards = ranks.from_first(self._shards)
 
     def run(self) -> None:
         """Train all remaining rounds."""
-        config = self.config
-        exam = evaluation.Exam.prepare(self._validation, w=config.w, timeout=config.timeout, threads=self.threads)
+        config, first = self.config, self.ranks.rank == 0
+        exam = (
+            evaluation.Exam.prepare(self._validation, w=config.w, timeout=config.timeout, threads=self.threads)
+            if first
+            else None
+        )
         batches = BatchMaker(self._instances, config.policy, augment=config.augment)
-        aggregator = Aggregator(config, self.policy, self._teacher, self._instances)
-        writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history))
+        aggregator = Aggregator(config, self.policy, self._teacher, self._instances, self.ranks)
+        writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         try:
             for number in range(len(self.history), config.epochs):
                 row = self._round(number, aggregator, batches, exam)
                 self.history.append(row)
-                for name, value in asdict(row).items():
-                    if value is not None and name != "round":
-                        writer.add_scalar(name, value, number)
-                writer.flush()
-                self._save()
+                if writer is not None:
+                    for name, value in asdict(row).items():
+                        if value is not None and name != "round":
+                            writer.add_scalar(name, value, number)
+                    writer.flush()
+                    self._save()
                 self.progress.finished(row)
         finally:
-            writer.close()
+            if writer is not None:
+                writer.close()
             aggregator.close()
 
-    def _round(self, number: int, aggregator: Aggregator, batches: BatchMaker, exam: evaluation.Exam) -> Round:
+    def _round(self, number: int, aggregator: Aggregator, batches: BatchMaker, exam: evaluation.Exam | None) -> Round:
         config = self.config
         began, taught, unlabelled = self._clock(), self._teacher.seconds, 0
         if self._collects(number):
             self.progress.phase(number, "collecting")
             steps = config.dagger_steps if number else config.demonstration_steps
-            collected, unlabelled = aggregator.collect(number, steps)
-            collected.save(self._shard(number))
+            shares = self.ranks.gather(aggregator.collect(number, steps))
+            collected = Demonstrations.concatenate([share for share, _ in shares])
+            unlabelled = sum(count for _, count in shares)
+            if self.ranks.rank == 0:
+                collected.save(self._shard(number))
             self._shards.append(collected)
         demonstrations = Demonstrations.concatenate(self._shards)
         self._shards = [demonstrations]
@@ -195,7 +219,7 @@ class Training:
             demonstrations=len(demonstrations),
             unlabelled=unlabelled,
         )
-        if (number + 1) % config.validate_every == 0 or number + 1 == config.epochs:
+        if exam is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.epochs):
             self.progress.phase(number, "validation")
             self._validate(row, exam)
         row.seconds = self._seconds_before + self._clock() - self._began
@@ -214,14 +238,18 @@ class Training:
         losses, accuracies = np.zeros(updates), np.zeros(updates)
         robots = config.batch_size * config.num_agents
         for update, chosen in enumerate(draws):
-            batch = batches.batch(demonstrations, chosen, rng).to(config.device)
+            own = chosen[self.ranks.rank :: self.ranks.count]
+            batch = batches.batch(demonstrations, own, rng).to(config.device)
             outcome = self.loss(batch)
             self.optimizer.zero_grad()
             outcome["loss_imitation"].backward()
             self.optimizer.step()
             losses[update], accuracies[update] = outcome["loss_imitation"].item(), outcome["accuracy"].item()
             self.progress.fitted(number, update + 1, updates, losses[: update + 1], robots)
-        return float(losses.mean()), float(accuracies.mean()), updates
+        if self.ranks.count > 1:  # the last batch's statistics are each process's own
+            self.policy.load_state_dict(self.ranks.from_first(self.policy.state_dict()))
+        means = self.ranks.average(torch.tensor([losses.mean(), accuracies.mean()])).tolist()
+        return means[0], means[1], updates
 
     def _pass(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[npt.NDArray[np.intp]]:
         """Every state once, in random order."""
@@ -256,6 +284,7 @@ class Training:
     def _save(self) -> None:
         """Write the records of the round, then the state that says it is done."""
         state = {
+            "processes": self.ranks.count,
             "policy": self.policy.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "scheduler": self.scheduler.state_dict(),
@@ -271,17 +300,35 @@ class Training:
         with replacing(self.folder / "state.pt") as draft:
             torch.save(state, draft)
 
-    def _restore(self) -> None:
+    def _read_state(self) -> dict[str, Any] | None:
         file = self.folder / "state.pt"
+        if not file.exists():
+            return None
         try:
-            state: dict[str, Any] = torch.load(file, weights_only=True, map_location=self.config.device)
+            return torch.load(file, weights_only=True, map_location="cpu")
+        except (pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError, RuntimeError):
+            raise self._damaged() from None
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        try:
+            processes = state["processes"]
             self.policy.load_state_dict(state["policy"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.scheduler.load_state_dict(state["scheduler"])
             self.history = [Round(**row) for row in state["history"]]
-        except (pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError, RuntimeError):
-            raise ValueError(f"{file} is damaged: choose another folder with --run, or delete this one") from None
+        except (KeyError, TypeError, ValueError, RuntimeError):
+            raise self._damaged() from None
+        if processes != self.ranks.count:
+            raise ValueError(
+                f"{self.folder} holds a run of {processes} processes, not of {self.ranks.count}: go on with as many, "
+                "or choose another folder with --run"
+            )
         self._seconds_before = self.history[-1].seconds
+
+    def _damaged(self) -> ValueError:
+        return ValueError(
+            f"{self.folder / 'state.pt'} is damaged: choose another folder with --run, or delete this one"
+        )
 
 
 def _on_device(policy: DecentralizedPolicy, device: str) -> DecentralizedPolicy:

@@ -16,6 +16,8 @@ from mapf_env.instance import Instance
 from mapf_env.team_state import TeamState
 
 _FLOAT = np.dtype(np.float32)
+_Cases = tuple[npt.NDArray[np.bool_], rules.Positions, rules.Positions, npt.NDArray[np.int32]]
+"""Grids (M, H, W), starts and goals (M, N, 2) and how many robots are there (M,)."""
 
 
 class Observation(NamedTuple):
@@ -45,6 +47,8 @@ class Step(NamedTuple):
     """(B, N) the shield replaced the robot's action."""
     arrived: npt.NDArray[np.bool_]
     """(B, N) the robot has come to its goal in this step; in lifelong tasks their sum is the throughput."""
+    final_observation: Observation | None = None
+    """With autoreset SAME_STEP the last observations of the teams that have ended, in their order, if any have."""
 
 
 class BatchedEnv:
@@ -58,7 +62,7 @@ class BatchedEnv:
         threads: Over how many threads the environments of a step are spread; it changes no result.
         autoreset: As in Gymnasium: DISABLED; NEXT_STEP, the step after the end ignores the actions and begins the next
             episode; or SAME_STEP, the step that ends returns the first observation of the next episode, and
-            `final_observation` has the last ones of those that ended.
+            `Step.final_observation` has the last ones of those that ended.
         cases: Instances to play, drawn anew at each reset by the seed, in place of random ones.
         fill: Take instances that are smaller than the environment too: the map is filled up with obstacles, and the
             robots that are not there have zeros everywhere; `present` says which are.
@@ -91,7 +95,6 @@ class BatchedEnv:
         self._cases = cases
         if cases is not None:
             self._stack(cases)  # refuses what does not fit
-        self.final_observation: Observation | None = None
         self._fov_shape = (num_envs, config.num_agents, config.num_channels, config.fov_side, config.fov_side)
         self._graph_shape = (num_envs, config.num_agents, config.num_agents)
         self._dtype = np.dtype(config.dtype)
@@ -109,6 +112,8 @@ class BatchedEnv:
             max_cycles=config.max_cycles,
             weights=int(config.comm_weights == "distance"),
             message_loss=config.message_loss,
+            comm_radius=config.comm_radius,
+            connected=config.comm_range == "connected",
             extras=[CHANNELS.index(channel) for channel in config.extra_channels],
             rewards=list(config.rewards),
             threads=self.threads,
@@ -190,13 +195,12 @@ class BatchedEnv:
         chosen = np.arange(self.num_envs) if mask is None else np.flatnonzero(self._checked_mask(mask))
         self._begin(chosen, None if seed is None else self._checked_seeds(seed)[chosen], instances)
         self._state.replaced[chosen] = self._state.arrived[chosen] = False
-        self.final_observation = None
         return self._observe(out)
 
     def _begin(
         self, chosen: npt.NDArray[np.intp], streams: npt.NDArray[np.uint64] | None, instances: Sequence[Instance] | None
     ) -> None:
-        state, config, pad = self._state, self.config, self.config.fov_radius
+        state = self._state
         episodes = state.episodes[chosen] if streams is None else np.zeros_like(chosen, np.uint64)
         if streams is None:
             streams, new = state.streams[chosen], ~state.started[chosen]
@@ -206,38 +210,14 @@ class BatchedEnv:
         if instances is None and self._cases is not None:
             draws = _native.mix(seeds, np.full_like(seeds, np.iinfo(np.uint64).max)) % np.uint64(len(self._cases))
             instances = [self._cases[i] for i in draws.tolist()]
-        where = slice(None) if len(chosen) == self.num_envs else chosen
-        sizes = np.int32(config.num_agents)
         if instances is None:
-            grids, starts, goals = self._draw(seeds)
+            cases = self._draw(seeds)
+        elif len(instances) == len(chosen):
+            cases = self._stack(instances)
         else:
-            if len(instances) != len(chosen):
-                raise ValueError(f"{len(instances)} instances for {len(chosen)} environments: give one for each")
-            grids, starts, goals, sizes = self._stack(instances)
-        begun: dict[str, Any] = {"comm_radius": np.float64(config.comm_radius)}
-        if config.comm_range == "connected":
-            teams = [team[:size] for team, size in zip(starts, np.broadcast_to(sizes, len(starts)), strict=True)]
-            begun["comm_radius"] = [rules.connecting_radius(team, config.comm_radius) for team in teams]
-        if config.task == "lifelong" or config.needs_distances:
-            obstacles = rules.bordered(grids, pad, np.uint8)
-            if config.task == "lifelong":
-                begun["regions"] = _native.regions(obstacles, pad)
-            if config.needs_distances:
-                begun["distances"] = rules.distance_tables(obstacles, pad, goals)
-        state.obstacles[where, pad:-pad, pad:-pad] = grids
-        state.streams[where], state.episodes[where] = streams, episodes + np.uint64(1)
-        state.begin(
-            where,
-            seeds=seeds,
-            grids=grids,
-            team_sizes=sizes,
-            positions=starts,
-            previous=starts,
-            goals=goals,
-            on_goal=(starts == goals).all(axis=2) & (np.arange(config.num_agents) < np.reshape(sizes, (-1, 1))),
-            started=True,
-            **begun,
-        )
+            raise ValueError(f"{len(instances)} instances for {len(chosen)} environments: give one for each")
+        self.stepper.begin(chosen, seeds, *cases)
+        state.streams[chosen], state.episodes[chosen] = streams, episodes + np.uint64(1)
 
     def step(self, actions: npt.ArrayLike, out: Observation | None = None) -> Step:
         """Shield and execute the joint actions (B, N), integers 0..4.
@@ -254,7 +234,7 @@ class BatchedEnv:
             RuntimeError: Before the first reset, or if a team has ended and was not reset.
         """
         observation = self.buffers() if out is None else out
-        self.advance(np.asarray(actions), observation)
+        final = self.advance(np.asarray(actions), observation)
         state = self._state
         return Step(
             observation,
@@ -263,24 +243,26 @@ class BatchedEnv:
             state.truncated.copy(),
             state.replaced.copy(),
             state.arrived.copy(),
+            final,
         )
 
-    def advance(self, actions: npt.NDArray[Any], out: Observation) -> None:
-        """`step` without copies of the outcome, which stands in the state."""
+    def advance(self, actions: npt.NDArray[Any], out: Observation) -> Observation | None:
+        """`step` without copies of the outcome, which stands in the state; returns the final observation."""
         if self.autoreset is AutoresetMode.DISABLED:
             self._execute(actions, out, skip_ended=False)
-            return
+            return None
         state = self._state
         due = state.ended.copy()
         self._execute(actions, out, skip_ended=self.began)
-        self.final_observation = None
+        final = None
         if self.autoreset is AutoresetMode.SAME_STEP:
             due = state.ended.copy()
             if due.any():
-                self.final_observation = Observation(*(np.asarray(part)[due] for part in out))
+                final = Observation(*(np.asarray(part)[due] for part in out))
         if due.any():
             self._begin(np.flatnonzero(due), None, None)
             self.stepper.observe(*out, due)
+        return final
 
     def _execute(self, actions: npt.NDArray[Any], out: Observation, *, skip_ended: bool) -> None:
         if actions.ndim == 3:
@@ -330,14 +312,12 @@ class BatchedEnv:
             raise ValueError(f"mask must be bool of shape ({self.num_envs},), got {array.dtype} of shape {array.shape}")
         return array
 
-    def _draw(self, seeds: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.bool_], rules.Positions, rules.Positions]:
+    def _draw(self, seeds: npt.NDArray[np.uint64]) -> _Cases:
         config = self.config
         grids = random_maps(seeds, height=config.height, width=config.width, density=config.density, style=config.style)
-        return grids, *random_cases(seeds, grids, config.num_agents)
+        return grids, *random_cases(seeds, grids, config.num_agents), np.full(len(seeds), config.num_agents, np.int32)
 
-    def _stack(
-        self, instances: Sequence[Instance]
-    ) -> tuple[npt.NDArray[np.bool_], rules.Positions, rules.Positions, npt.NDArray[np.int32]]:
+    def _stack(self, instances: Sequence[Instance]) -> _Cases:
         config = self.config
         grids = np.ones((len(instances), config.height, config.width), np.bool_)
         starts, goals = (np.zeros((len(instances), config.num_agents, 2), np.int32) for _ in range(2))

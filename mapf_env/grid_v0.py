@@ -15,7 +15,7 @@ from gymnasium import spaces
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from mapf_env import _native
-from mapf_env.batched_env import BatchedEnv, Observation
+from mapf_env.batched_env import BatchedEnv
 from mapf_env.config import EnvConfig
 from mapf_env.instance import Instance
 from mapf_env.pixels import picture, text
@@ -80,6 +80,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self.action_spaces = {agent: copy.deepcopy(moves) for agent in self.possible_agents}
         self.state_space = spaces.Box(0.0, 1.0, (3, H, W), np.float32)
         self._masks_shape = (N, 5)
+        self._memory: Any = _native.MemoryFloat32 if config.dtype == "float32" else _native.MemoryUint8
         self._reused: _Reused | None = None
         self._shown_lines = 0
 
@@ -149,11 +150,10 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self._batch.reset(seed, instances=None if instance is None else [instance], out=buffers)
         self.agents = list(self.possible_agents)
         if reused is None:
-            observations, infos, masks = self._fresh(*buffers)
+            observations, infos, memory = self._fresh(*buffers)
         else:
-            (observations, *_, infos), masks = reused.returned, reused.masks
-        masks[:] = self._batch.action_mask()[0]
-        self._batch.stepper.outcome_by_agent(self.agents, {}, {}, {}, infos)
+            (observations, *_, infos), memory = reused.returned, reused.memory
+        self._batch.stepper.outcome_by_agent(memory, self.agents, {}, {}, {}, infos)
         if self.render_mode == "human":
             self.render()
         return observations, infos
@@ -175,21 +175,19 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
             self._reused = _Reused(self)
         batch, reused = self._batch, self._reused
         if reused is None:
-            fov, graph = batch.buffers()
-            observations, infos, masks = self._fresh(fov, graph)
+            buffers = batch.buffers()
+            observations, infos, memory = self._fresh(*buffers)
             rewards, terminated, truncated = {}, {}, {}
         else:
-            (fov, graph), masks = reused.buffers, reused.masks
+            buffers, memory = reused.buffers, reused.memory
             observations, rewards, terminated, truncated, infos = reused.returned
-        stepper, outcome = batch.stepper, (rewards, terminated, truncated, infos)
-        ended = None
+        stepper, ended = batch.stepper, None
         if not self._preferences:
-            ended = stepper.step_agents(actions, agents, fov, graph, masks, *outcome)
+            ended = stepper.step_agents(actions, memory, agents, rewards, terminated, truncated, infos)
         if ended is None:
             wanted = np.array([self._checked(actions)], np.float32 if self._preferences else np.int64)
-            batch.advance(wanted, Observation(fov, graph))
-            masks[:] = batch.action_mask()[0]
-            ended = stepper.outcome_by_agent(agents, *outcome)
+            batch.advance(wanted, buffers)
+            ended = stepper.outcome_by_agent(memory, agents, rewards, terminated, truncated, infos)
         if ended:
             self.agents = []
         if self.render_mode == "human":
@@ -227,12 +225,15 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
 
     def _fresh(
         self, fov: npt.NDArray[Any], graph: npt.NDArray[np.float32]
-    ) -> tuple[dict[str, Any], dict[str, Any], npt.NDArray[np.int8]]:
-        """Observations and infos by agent, whose arrays are rows of (1, N, C, F, F), (1, N, N) and masks (N, 5)."""
+    ) -> tuple[dict[str, Any], dict[str, Any], Any]:
+        """Observations and infos by agent, whose arrays are rows of (1, N, C, F, F), (1, N, N) and masks (N, 5).
+
+        And these as memory for the stepper, of its dtype.
+        """
         agents, rows = self.possible_agents, _native.rows_by_agent
         masks = np.empty(self._masks_shape, np.int8)
         names, columns = (("fov", "graph"), (fov[0], graph[0])) if self._observation == "dict" else ((), (fov[0],))
-        return rows(agents, names, columns), rows(agents, ("action_mask",), (masks,)), masks
+        return rows(agents, names, columns), rows(agents, ("action_mask",), (masks,)), self._memory(fov, graph, masks)
 
     def _checked(self, actions: dict[str, Any]) -> list[Any]:
         """The actions in the order of agents, or what is wrong with them."""
@@ -252,7 +253,7 @@ class _Reused:
 
     def __init__(self, env: GridEnv) -> None:
         self.buffers = env._batch.buffers()
-        observations, infos, self.masks = env._fresh(*self.buffers)
+        observations, infos, self.memory = env._fresh(*self.buffers)
         self.returned: tuple[dict[str, Any], ...] = (observations, {}, {}, {}, infos)
 
 

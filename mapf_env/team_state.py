@@ -96,8 +96,3 @@ class TeamState:
             on_goal=np.zeros((B, N), np.bool_),
             action_mask=np.zeros((B, N, 5), np.int8),
         )
-
-    def begin(self, chosen: npt.NDArray[np.intp] | slice, **begun: npt.ArrayLike) -> None:
-        """Begin episodes of the chosen environments: write the given arrays, and zeros into what counts steps."""
-        for name, value in (dict.fromkeys(("under_way", "arrivals", "times", "ended"), 0) | begun).items():
-            getattr(self, name)[chosen] = value

@@ -6,11 +6,13 @@ Run as a script this is a target for coverage-guided fuzzing, which needs `pip i
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +22,9 @@ GRID = [[0, 0, 1, 0], [0, 0, 0, 1], [1, 1, 0, 0]]
 MAP = b"type octile\nheight 3\nwidth 4\nmap\n..@.\nGS.T\nOW..\n"
 SCEN = b"version 1\n0\ta.map\t4\t3\t0\t0\t2\t1\t2.41421356\n1\ta.map\t4\t3\t1\t1\t3\t2\t2.41421356\n"
 
-try:
-    import atheris
-except ImportError:
+atheris: Any = importlib.import_module("atheris") if __name__ == "__main__" else None
+with atheris.instrument_imports(include=["mapf_env"]) if atheris else nullcontext():
     import mapf_env
-else:
-    with atheris.instrument_imports(include=["mapf_env"]):
-        import mapf_env
 
 Reader = Callable[[Path], Any]
 READERS: dict[str, Reader] = {"map": mapf_env.load_map, "scen": mapf_env.load_scen, "json": mapf_env.load_instances}

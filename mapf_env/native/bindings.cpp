@@ -295,22 +295,6 @@ Out<mapf::Distance> distance_tables(In<T, 3> obstacles, int pad, In<std::int32_t
     return out;
 }
 
-// The connected region of each cell of maps in their borders, (B, size); -1 on obstacles.
-template <class T>
-Out<std::int32_t> regions(In<T, 3> obstacles, int pad) {
-    const auto layout = layout_of(obstacles, pad);
-    const std::size_t size = layout.size();
-    auto [labels, out] = make_array<std::int32_t>({obstacles.shape(0), size});
-    std::vector<std::int32_t> inner(static_cast<std::size_t>(layout.height) * layout.width);
-    std::fill_n(labels, obstacles.shape(0) * size, -1);
-    for (std::size_t b = 0; b < obstacles.shape(0); ++b, labels += size) {
-        mapf::label_components(mapf::grid_of(layout, obstacles.data() + b * size), inner.data());
-        for (int row = 0; row < layout.height; ++row)
-            std::copy_n(inner.data() + row * layout.width, layout.width, labels + layout.cell(row, 0));
-    }
-    return out;
-}
-
 template <class T>
 Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, In<float, 3> values,
                              In<std::int64_t, 2> actions, In<std::int32_t, 2> under_way, In<std::uint64_t, 1> seeds,
@@ -392,8 +376,6 @@ void define_for_dtype(nb::module_& m) {
           "radius"_a, "channel"_a, "out"_a.noconvert(), "Write a channel beyond the paper into out (B, N, side, side).");
     m.def("distance_tables", &distance_tables<T>, "obstacles"_a, "pad"_a, "goals"_a,
           "(B, N, size) uint16 steps from each cell of the bordered map to each goal; 65535 where there is no way.");
-    m.def("regions", &regions<T>, "obstacles"_a, "pad"_a,
-          "(B, size) int32 connected region of each cell of the bordered maps; -1 on obstacles.");
     m.def("pibt_shield", &pibt_shield<T>, "obstacles"_a, "pad"_a, "positions"_a, "values"_a, "actions"_a,
           "under_way"_a, "seeds"_a, "times"_a,
           "(B, N) int8 actions by priority inheritance, from values (B, N, 5) or, if these are empty, actions (B, N).");

@@ -101,7 +101,12 @@ void add_cells(MapBuilder& map, int obstacles, Random& random) {
     std::vector<int> cells;
     for (int row = 0; row < layout.height; ++row)
         for (int col = 0; col < layout.width; ++col) cells.push_back(layout.cell(row, col));
-    random.shuffle_front(cells, static_cast<int>(cells.size()));
+    // Drawn as they are needed: most maps have few obstacles.
+    const int count = static_cast<int>(cells.size());
+    for (int i = 0; i < count && map.obstacles() < obstacles; ++i) {
+        std::swap(cells[i], cells[i + random.below(count - i)]);
+        map.try_block(cells[i]);
+    }
     // A cell that would cut the map may become removable once its surroundings are full: go round again. Some free
     // cell can always be blocked without a cut, so every round makes progress.
     while (map.obstacles() < obstacles)

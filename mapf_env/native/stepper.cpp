@@ -47,6 +47,8 @@ void set(PyObject* row, PyObject* name, PyObject* value) {
     if (value == nullptr || PyDict_SetItem(row, name, value) != 0) throw nb::python_error();
 }
 
+nb::object name(const char* text) { return nb::steal(PyUnicode_InternFromString(text)); }
+
 // A new reference to sequence[i].
 nb::object item(PyObject* sequence, Py_ssize_t i) {
     nb::object value = nb::steal(PySequence_GetItem(sequence, i));
@@ -90,12 +92,21 @@ bool read_actions(const nb::dict& actions, const nb::list& agents, std::vector<s
     return true;
 }
 
+// Where the observations of the only team of a batch go.
+template <class T>
+struct Memory {
+    InOut<T, 5> fov;             // (1, N, C, side, side)
+    InOut<float, 3> graph;       // (1, N, N)
+    InOut<std::int8_t, 2> masks; // (N, 5)
+};
+
 // The rules bound to the arrays of B teams, which Python owns and this changes in place.
 template <class T>
 class Stepper {
 public:
     Stepper(nb::object state, int pad, bool pibt, bool lifelong, int max_cycles, int weights, double message_loss,
-            const std::vector<int>& extras, const std::vector<float>& rewards, int threads)
+            double comm_radius, bool connected, const std::vector<int>& extras, const std::vector<float>& rewards,
+            int threads)
         : state_(std::move(state)), threads_(threads) {
         const auto positions = array<std::int32_t, 3>("positions");
         const auto obstacles = array<T, 3>("obstacles");
@@ -112,6 +123,8 @@ public:
         teams_.goals = own<std::int32_t>("goals", {B, N, 2});
         teams_.previous = own<std::int32_t>("previous", {B, N, 2});
         teams_.team_sizes = own<std::int32_t>("team_sizes", {B});
+        teams_.grids = own<bool>("grids", {B, teams_.layout.height * 1u, teams_.layout.width * 1u});
+        teams_.started = own<bool>("started", {B});
         teams_.seeds = own<std::uint64_t>("seeds", {B});
         teams_.comm_radius = own<double>("comm_radius", {B});
         teams_.regions = own<std::int32_t>("regions", {B, size}, !lifelong);
@@ -126,7 +139,8 @@ public:
         teams_.arrived = own<bool>("arrived", {B, N});
         teams_.on_goal = own<bool>("on_goal", {B, N});
         teams_.action_mask = own<std::int8_t>("action_mask", {B, N, num_actions});
-        options_ = {pad, pibt, lifelong, max_cycles, static_cast<Weights>(weights), message_loss, {},
+        options_ = {pad, pibt, lifelong, max_cycles, static_cast<Weights>(weights), message_loss,
+                    comm_radius, connected, {},
                     {rewards[0], rewards[1], rewards[2], rewards[3], rewards[4], rewards[5]}};
         for (const int extra : extras) options_.extras.push_back(static_cast<Channel>(extra));
         const bool distances = options_.rewards.closer != 0.0f ||
@@ -170,43 +184,70 @@ public:
         });
     }
 
-    // What the last step brought to the first team, by agent, in dictionaries that are filled in place.
-    // Returns whether the episode has ended.
-    bool outcome_by_agent(nb::list agents, nb::dict rewards, nb::dict terminated, nb::dict truncated, nb::dict infos) {
-        static constexpr std::array names{"replaced", "on_goal", "arrived"};
-        if (agents.size() != teams_.num_agents) fail("give one name for each agent");
+    // What the last step brought to the only team, by agent, in dictionaries that are filled in place, and its action
+    // masks. Returns whether the episode has ended.
+    bool outcome_by_agent(const Memory<T>& memory, nb::list agents, nb::dict rewards, nb::dict terminated,
+                          nb::dict truncated, nb::dict infos) {
+        const std::size_t N = teams_.num_agents;
+        if (teams_.num_envs != 1 || agents.size() != N) fail("give one name for each agent of one team");
+        require_masks(memory);
+        write_action_mask(teams_, 0);
+        if (memory.masks.data() != teams_.action_mask)
+            std::copy_n(teams_.action_mask, N * num_actions, memory.masks.data());
         const std::array flags{teams_.replaced, teams_.on_goal, teams_.arrived};
-        std::array<nb::object, 3> keys;
-        for (std::size_t k = 0; k < keys.size(); ++k) keys[k] = nb::steal(PyUnicode_InternFromString(names[k]));
         const std::size_t num_flags = options_.lifelong ? 3 : 2;
         PyObject* const ended[2] = {teams_.terminated[0] ? Py_True : Py_False, teams_.truncated[0] ? Py_True : Py_False};
-        for (std::size_t i = 0; i < teams_.num_agents; ++i) {
+        nb::object reward;
+        for (std::size_t i = 0; i < N; ++i) {
             PyObject* agent = PyList_GetItem(agents.ptr(), static_cast<Py_ssize_t>(i));
-            set(rewards.ptr(), agent, nb::steal(PyFloat_FromDouble(teams_.rewards[i])).ptr());
+            if (i == 0 || teams_.rewards[i] != teams_.rewards[i - 1])
+                reward = nb::steal(PyFloat_FromDouble(teams_.rewards[i]));
+            set(rewards.ptr(), agent, reward.ptr());
             set(terminated.ptr(), agent, ended[0]);
             set(truncated.ptr(), agent, ended[1]);
             PyObject* info = PyDict_GetItem(infos.ptr(), agent);
             if (info == nullptr || !PyDict_Check(info)) fail("infos must have a dictionary for each agent");
-            for (std::size_t k = 0; k < num_flags; ++k)
-                set(info, keys[k].ptr(), flags[k][i] ? Py_True : Py_False);
+            for (std::size_t k = 0; k < num_flags; ++k) set(info, info_names_[k].ptr(), flags[k][i] ? Py_True : Py_False);
         }
         return teams_.ended[0];
     }
 
-    // `step`, the action masks and `outcome_by_agent` of a batch of one; None, and nothing done, if the actions cannot
-    // be read.
-    std::optional<bool> step_agents(nb::dict actions, nb::list agents, InOut<T, 5> fov, InOut<float, 3> graph,
-                                    InOut<std::int8_t, 2> masks, nb::dict rewards, nb::dict terminated,
-                                    nb::dict truncated, nb::dict infos) {
-        const std::size_t N = teams_.num_agents;
-        wanted_.resize(N);
+    // `step` and `outcome_by_agent` of the only team; None, and nothing done, if the actions cannot be read.
+    std::optional<bool> step_agents(nb::dict actions, const Memory<T>& memory, nb::list agents, nb::dict rewards,
+                                    nb::dict terminated, nb::dict truncated, nb::dict infos) {
+        wanted_.resize(teams_.num_agents);
         if (teams_.num_envs != 1 || !read_actions(actions, agents, wanted_)) return std::nullopt;
-        if (masks.shape(0) != N || masks.shape(1) != num_actions) fail("the memory for masks must have shape (N, 5)");
         require_actions(wanted_.data());
-        run({wanted_.data(), nullptr}, fov, graph, false);
-        write_action_mask(teams_, 0);
-        if (masks.data() != teams_.action_mask) std::copy_n(teams_.action_mask, N * num_actions, masks.data());
-        return outcome_by_agent(agents, rewards, terminated, truncated, infos);
+        require_masks(memory);
+        run({wanted_.data(), nullptr}, memory.fov, memory.graph, false);
+        return outcome_by_agent(memory, agents, rewards, terminated, truncated, infos);
+    }
+
+    // Begins episodes of M chosen teams with the given cases; nothing is changed if one of them cannot begin.
+    void begin(In<std::int64_t, 1> chosen, In<std::uint64_t, 1> seeds, In<bool, 3> grids, In<std::int32_t, 3> starts,
+               In<std::int32_t, 3> goals, In<std::int32_t, 1> sizes) {
+        const auto& layout = teams_.layout;
+        const std::size_t M = chosen.shape(0), N = teams_.num_agents, height = layout.height, width = layout.width;
+        if (grids.shape(0) != M || grids.shape(1) != height || grids.shape(2) != width)
+            fail("grids must have shape " + shown({M, height, width}));
+        if (starts.shape(0) != M || starts.shape(1) != N || starts.shape(2) != 2 || goals.shape(0) != M ||
+            goals.shape(1) != N || goals.shape(2) != 2)
+            fail("starts and goals must have shape " + shown({M, N, 2}));
+        if (seeds.shape(0) != M || sizes.shape(0) != M) fail("give one seed and size for each team");
+        for (std::size_t k = 0; k < M; ++k) {
+            if (static_cast<std::uint64_t>(chosen(k)) >= teams_.num_envs) fail("there is no such environment");
+            if (static_cast<std::uint32_t>(sizes(k)) > N) fail("a team is larger than the environment's");
+            for (std::size_t i = 2 * N * k; i < 2 * (N * k + sizes(k)); i += 2)
+                for (const std::int32_t* cell : {starts.data() + i, goals.data() + i})
+                    if (!layout.contains(cell[0], cell[1])) fail("a start or goal lies outside the map");
+        }
+        std::vector<Case> cases;
+        nb::gil_scoped_release release;
+        cases.reserve(M);
+        for (std::size_t k = 0; k < M; ++k)
+            cases.push_back(case_of(teams_, reinterpret_cast<const std::uint8_t*>(grids.data()) + k * height * width,
+                                    starts.data() + 2 * N * k, goals.data() + 2 * N * k, sizes(k)));
+        for (std::size_t k = 0; k < M; ++k) begin_team(teams_, options_, chosen(k), seeds(k), cases[k]);
     }
 
     void write_action_masks() {
@@ -241,6 +282,11 @@ private:
             fail("the memory for graphs must have shape " + shown({B, N, N}));
     }
 
+    void require_masks(const Memory<T>& memory) const {
+        if (memory.masks.shape(0) != teams_.num_agents || memory.masks.shape(1) != num_actions)
+            fail("the memory for masks must have shape " + shown({teams_.num_agents, num_actions}));
+    }
+
     void require_actions(const std::int64_t* actions) const {  // of all robots, those that are not there too
         const std::size_t robots = teams_.num_envs * teams_.num_agents;
         const auto is_none = [](std::int64_t action) { return static_cast<std::uint64_t>(action) >= num_actions; };
@@ -269,9 +315,7 @@ private:
         if (pool_ && process_ != process()) (void)pool_.release();  // threads do not survive a fork
         if (!pool_) pool_ = std::make_unique<Pool>(static_cast<int>(parts));
         process_ = process();
-        pool_->run([&](int part) {
-            for (std::size_t b = B * part / parts; b < B * (part + 1) / parts; ++b) job(b, scratch_[part]);
-        });
+        pool_->for_each(B, [&](std::size_t b, int part) { job(b, scratch_[part]); });
     }
 
     void run(Wishes wishes, const InOut<T, 5>& fov, const InOut<float, 3>& graph, bool skip_ended) {
@@ -304,36 +348,46 @@ private:
     Options options_;
     std::vector<TeamScratch<T>> scratch_;
     std::vector<std::int64_t> wanted_;
+    std::array<nb::object, 3> info_names_{name("replaced"), name("on_goal"), name("arrived")};
     int threads_, process_ = 0;
     std::unique_ptr<Pool> pool_;
 };
 
 template <class T>
-void define(nb::module_& m, const char* name) {
+void define(nb::module_& m, const char* name, const char* memory) {
+    nb::class_<Memory<T>>(m, memory, "Where the observations and action masks of the only team of a batch go.")
+        .def("__init__",
+             [](Memory<T>* self, InOut<T, 5> fov, InOut<float, 3> graph, InOut<std::int8_t, 2> masks) {
+                 new (self) Memory<T>{std::move(fov), std::move(graph), std::move(masks)};
+             },
+             "fov"_a.noconvert(), "graph"_a.noconvert(), "masks"_a.noconvert());
     nb::class_<Stepper<T>>(m, name, "The rules of motion and perception, bound to the arrays of B teams.")
-        .def(nb::init<nb::object, int, bool, bool, int, int, double, std::vector<int>, std::vector<float>, int>(),
-             "state"_a, "pad"_a, "pibt"_a, "lifelong"_a, "max_cycles"_a, "weights"_a, "message_loss"_a, "extras"_a,
-             "rewards"_a, "threads"_a)
+        .def(nb::init<nb::object, int, bool, bool, int, int, double, double, bool, std::vector<int>, std::vector<float>, int>(),
+             "state"_a, "pad"_a, "pibt"_a, "lifelong"_a, "max_cycles"_a, "weights"_a, "message_loss"_a, "comm_radius"_a,
+             "connected"_a, "extras"_a, "rewards"_a, "threads"_a)
         .def("step", &Stepper<T>::step, "actions"_a, "fov"_a.noconvert(), "graph"_a.noconvert(), "skip_ended"_a,
              "Execute joint actions (B, N) under the shield and write what the robots perceive.")
         .def("step_by_values", &Stepper<T>::step_by_values, "values"_a, "fov"_a.noconvert(), "graph"_a.noconvert(),
              "skip_ended"_a, "Execute by values of all five actions (B, N, 5), under shield \"pibt\" only.")
         .def("observe", &Stepper<T>::observe, "fov"_a.noconvert(), "graph"_a.noconvert(), "chosen"_a.none(),
              "Write what the robots perceive, of all teams or of the chosen ones (B,).")
-        .def("outcome_by_agent", &Stepper<T>::outcome_by_agent, "agents"_a, "rewards"_a, "terminated"_a, "truncated"_a,
-             "infos"_a, "Fill dictionaries with what the last step brought to the agents of the first team.")
-        .def("step_agents", &Stepper<T>::step_agents, "actions"_a, "agents"_a, "fov"_a.noconvert(),
-             "graph"_a.noconvert(), "masks"_a.noconvert(), "rewards"_a, "terminated"_a, "truncated"_a, "infos"_a,
+        .def("outcome_by_agent", &Stepper<T>::outcome_by_agent, "memory"_a, "agents"_a, "rewards"_a, "terminated"_a,
+             "truncated"_a, "infos"_a,
+             "Write the masks and fill dictionaries with what the last step brought to the agents of the only team.")
+        .def("step_agents", &Stepper<T>::step_agents, "actions"_a, "memory"_a, "agents"_a, "rewards"_a, "terminated"_a,
+             "truncated"_a, "infos"_a,
              "Step the only team by actions by agent and fill the dictionaries; whether the episode has ended, or None "
              "if the actions cannot be read.")
+        .def("begin", &Stepper<T>::begin, "chosen"_a, "seeds"_a, "grids"_a, "starts"_a, "goals"_a, "sizes"_a,
+             "Begin episodes of the chosen environments (M,) with cases (M, ...), all of them or none.")
         .def("write_action_masks", &Stepper<T>::write_action_masks, "Bring the state's action_mask (B, N, 5) up to date.");
 }
 
 }  // namespace
 
 void define_stepper(nb::module_& m) {
-    define<float>(m, "StepperFloat32");
-    define<std::uint8_t>(m, "StepperUint8");
+    define<float>(m, "StepperFloat32", "MemoryFloat32");
+    define<std::uint8_t>(m, "StepperUint8", "MemoryUint8");
     m.def("rows_by_agent", &rows_by_agent, "agents"_a, "names"_a, "columns"_a,
           "{agent: {name: column[i]}} as new dictionaries; without names {agent: column[i]}.");
 }

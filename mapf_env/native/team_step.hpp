@@ -27,6 +27,8 @@ struct Options {
     int max_cycles = 0;
     Weights weights = Weights::binary;
     double message_loss = 0.0;
+    double comm_radius = 0.0;
+    bool connected = false;  // comm_radius grows at the beginning until the team is connected
     std::vector<Channel> extras;
     Rewards rewards{};
 };
@@ -36,17 +38,18 @@ template <class T>
 struct Teams {
     Layout layout;
     std::size_t num_envs, num_agents;
-    const T* obstacles;             // (B, layout.size())
-    const std::int32_t* team_sizes; // (B)
-    const std::uint64_t* seeds;     // (B) of the episodes
-    const double* comm_radius;      // (B)
-    const std::int32_t* regions;    // (B, layout.size()), only if goals change
+    bool* grids;                    // (B, height, width)
+    T* obstacles;                   // (B, layout.size())
+    std::int32_t* team_sizes;       // (B)
+    std::uint64_t* seeds;           // (B) of the episodes
+    double* comm_radius;            // (B)
+    std::int32_t* regions;          // (B, layout.size()), only if goals change
     std::int32_t *positions, *goals, *previous;  // (B, N, 2)
     std::int32_t* under_way;        // (B, N) steps since the robot was on its goal
     std::int32_t* arrivals;         // (B, N) how often it has arrived
     Distance* distances;            // (B, N, layout.size()) to the goals, only where they are asked for
     std::int64_t* times;            // (B)
-    bool* ended;                    // (B)
+    bool *started, *ended;          // (B)
     // What the last step brought.
     float* rewards;                 // (B, N)
     bool *terminated, *truncated;   // (B)
@@ -54,9 +57,9 @@ struct Teams {
     std::int8_t* action_mask;       // (B, N, 5)
 };
 
-// Memory for the steps of one thread.
+// Memory for the steps of one thread, on cache lines of its own.
 template <class T>
-struct TeamScratch {
+struct alignas(64) TeamScratch {
     ShieldScratch shield;
     PibtScratch<T> pibt;
     std::vector<T> marks;
@@ -76,6 +79,72 @@ Grid grid_of(const Layout& layout, const T* obstacles) {
     std::vector<std::uint8_t> blocked(layout.size());
     std::transform(obstacles, obstacles + layout.size(), blocked.begin(), [](T cell) { return cell != T{0}; });
     return {layout, std::move(blocked)};
+}
+
+// What an episode begins with, and what it needs to know beforehand.
+struct Case {
+    const std::uint8_t* grid;             // (height, width)
+    const std::int32_t *starts, *goals;   // (N, 2)
+    int size;                             // robots that are there
+    std::vector<Distance> distances;      // (size, layout.size()), if they are asked for
+};
+
+// Throws std::overflow_error if a way is too long to be counted.
+template <class T>
+Case case_of(const Teams<T>& teams, const std::uint8_t* grid, const std::int32_t* starts, const std::int32_t* goals,
+                int size) {
+    Case result{grid, starts, goals, size, {}};
+    if (teams.distances == nullptr) return result;
+    const auto& layout = teams.layout;
+    std::vector<std::uint8_t> blocked(layout.size(), 1);
+    for (int row = 0; row < layout.height; ++row)
+        std::copy_n(grid + static_cast<std::size_t>(row) * layout.width, layout.width, &blocked[layout.cell(row, 0)]);
+    const Grid map(layout, std::move(blocked));
+    std::vector<Distance> distance;
+    std::vector<int> queue;
+    result.distances.reserve(static_cast<std::size_t>(size) * layout.size());
+    for (int i = 0; i < size; ++i) {
+        distances_to(map, layout.cell(goals[2 * i], goals[2 * i + 1]), distance, queue);
+        result.distances.insert(result.distances.end(), distance.begin(), distance.end());
+    }
+    return result;
+}
+
+// Begins an episode of team b.
+template <class T>
+void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, std::uint64_t seed, const Case& begun) {
+    const auto& layout = teams.layout;
+    const std::size_t N = teams.num_agents, first = b * N, size = layout.size();
+    const std::size_t area = static_cast<std::size_t>(layout.height) * layout.width;
+    T* obstacles = teams.obstacles + b * size;
+    bool* grid = teams.grids + b * area;
+    for (std::size_t cell = 0; cell < area; ++cell) grid[cell] = begun.grid[cell] != 0;
+    for (int row = 0; row < layout.height; ++row)
+        std::transform(grid + row * layout.width, grid + (row + 1) * layout.width, obstacles + layout.cell(row, 0),
+                       [](bool blocked) { return static_cast<T>(blocked); });
+    if (teams.regions != nullptr) {
+        std::vector<std::int32_t> inner(area);
+        label_components(grid_of(layout, obstacles), inner.data());
+        for (int row = 0; row < layout.height; ++row)
+            std::copy_n(inner.data() + row * layout.width, layout.width, teams.regions + b * size + layout.cell(row, 0));
+    }
+    if (teams.distances != nullptr)
+        std::copy(begun.distances.begin(), begun.distances.end(), teams.distances + first * size);
+    for (std::int32_t* cells : {teams.positions, teams.previous}) std::copy_n(begun.starts, 2 * N, cells + 2 * first);
+    std::copy_n(begun.goals, 2 * N, teams.goals + 2 * first);
+    for (std::size_t i = 0; i < N; ++i) {
+        const std::int32_t *start = begun.starts + 2 * i, *goal = begun.goals + 2 * i;
+        teams.on_goal[first + i] = static_cast<int>(i) < begun.size && start[0] == goal[0] && start[1] == goal[1];
+    }
+    std::fill_n(teams.under_way + first, N, 0);
+    std::fill_n(teams.arrivals + first, N, 0);
+    teams.team_sizes[b] = begun.size;
+    teams.seeds[b] = seed;
+    teams.comm_radius[b] = options.connected ? connecting_radius(begun.starts, begun.size, options.comm_radius)
+                                             : options.comm_radius;
+    teams.times[b] = 0;
+    teams.started[b] = true;
+    teams.ended[b] = false;
 }
 
 // Writes what team b perceives: fov (N, planes, side, side) and graph (N, N); zeros for robots that are not there.
@@ -233,10 +302,15 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
         for (bool* flags : {teams.replaced, teams.arrived, teams.on_goal}) std::fill_n(flags + first + n, missing, false);
     }
     teams.times[b] += 1;
-    teams.terminated[b] = all_on_goal && !options.lifelong;
-    teams.truncated[b] = !teams.terminated[b] && teams.times[b] >= options.max_cycles;
-    teams.ended[b] = teams.terminated[b] || teams.truncated[b];
-    if (teams.terminated[b])
+    // The flags of 64 teams share a cache line, for which threads would contend: it is written only if one changes.
+    const auto update = [](bool& flag, bool value) {
+        if (flag != value) flag = value;
+    };
+    const bool terminated = all_on_goal && !options.lifelong;
+    update(teams.terminated[b], terminated);
+    update(teams.truncated[b], !terminated && teams.times[b] >= options.max_cycles);
+    update(teams.ended[b], terminated || teams.truncated[b]);
+    if (terminated)
         for (int i = 0; i < n; ++i) teams.rewards[first + i] += scheme.solved;
     if (options.lifelong) give_goals(teams, b, scratch);
 }

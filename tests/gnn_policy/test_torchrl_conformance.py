@@ -1,6 +1,7 @@
 """The PettingZoo environment as TorchRL's own wrapper sees it (here, because only the pupil knows TorchRL)."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def test_a_collector_fills_batches_from_it():
     batches = list(collector)
     collector.shutdown()
     assert [tuple(batch.batch_size) for batch in batches] == [(30,), (30,)]
-    played = torch.cat(batches)
+    played: Any = torch.cat(batches)
     assert played["next", "done"].sum() == 6
     assert played["collector", "traj_ids"].unique().numel() == 7
     for now, later in pairwise(played):

@@ -48,6 +48,8 @@ def assert_equal(one: Any, other: Any) -> None:
         assert len(one) == len(other)
         for a, b in zip(one, other, strict=True):
             assert_equal(a, b)
+    elif one is None:
+        assert other is None
     else:
         assert one.dtype == other.dtype
         assert np.array_equal(one, other)
@@ -107,7 +109,7 @@ def test_a_batch_equals_single_environments(settings: dict[str, Any], seed: int)
         outcome = batch.step(actions)
         single_outcomes = [single.step(actions[b : b + 1]) for b, single in enumerate(singles)]
         for b, one in enumerate(single_outcomes):
-            assert_equal(tuple(part[b] for part in outcome[1:]), tuple(part[0] for part in one[1:]))
+            assert_equal(tuple(part[b] for part in outcome[1:6]), tuple(part[0] for part in one[1:6]))
         ended = outcome.terminated | outcome.truncated
         together = batch.reset(mask=ended)
         apart = [one.reset() if ended[b] else one.observe() for b, one in enumerate(singles)]

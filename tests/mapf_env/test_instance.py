@@ -132,3 +132,22 @@ def test_native_distances_and_components_agree_with_search_in_python(grid: oracl
         expected = [[steps.get((r, c), -1) for c in range(grid.shape[1])] for r in range(grid.shape[0])]
         assert table.tolist() == expected
         assert ((table >= 0) == (labels == labels[cell])).all()
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 168), (168, 1), (2, 126), (20, 20), (6, 62), (1, 424), (424, 1), (4, 200), (34, 34), (64, 40)]
+)
+@pytest.mark.parametrize("density", [0.0, 0.1, 0.4])
+def test_native_distances_on_maps_of_all_widths(shape: tuple[int, int], density: float) -> None:
+    # Maps up to 512 and up to 1,280 cells with their border are searched by words of 64 cells, larger ones by a queue.
+    random = np.random.default_rng(0)
+    grid = random.random(shape) < density
+    grid[0, 0] = False
+    free = np.argwhere(~grid).astype(np.int32)
+    cells = random.permutation(free)[:3]
+    for cell, table in zip(cells, _native.distances(grid, cells), strict=True):
+        steps = oracles.distances(grid, (int(cell[0]), int(cell[1])))
+        expected = np.full(shape, -1)
+        for (row, col), distance in steps.items():
+            expected[row, col] = distance
+        np.testing.assert_array_equal(table, expected)

@@ -1,6 +1,6 @@
 // Random teams under all options of the native core, to be run with AddressSanitizer and UBSan:
 //   c++ -std=c++20 -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all -I. tests/native/fuzz_world.cpp
-//     mapf_env/native/graph.cpp mapf_env/native/generate.cpp -o fuzz_world && ./fuzz_world SECONDS
+//     mapf_env/native/graph.cpp mapf_env/native/generate.cpp mapf_env/native/observe.cpp -o fuzz_world && ./fuzz_world SECONDS
 // Every buffer has exactly the size that it needs, and every executed step is checked for conflicts.
 #include <chrono>
 #include <cstdio>
@@ -43,23 +43,12 @@ void play(std::uint64_t seed) {
     teams.num_envs = 1;
     teams.num_agents = N;
     const std::size_t size = teams.layout.size();
-    std::vector<T> map(size, T{1});
+    const std::size_t area = static_cast<std::size_t>(height) * width;
+    std::vector<std::uint8_t> drawn(area);
     for (int row = 0; row < height; ++row)
-        for (int col = 0; col < width; ++col)
-            map[teams.layout.cell(row, col)] = static_cast<T>(grid.blocked[grid.layout.cell(row, col)]);
-    std::vector<std::int32_t> positions(2 * N), goals(2 * N), previous(2 * N), under_way(N), arrivals(N), regions(size, -1);
-    std::vector<std::int32_t> labels(static_cast<std::size_t>(height) * width);
-    place_agents(grid, n, random, positions.data(), goals.data());
-    previous = positions;
-    label_components(grid, labels.data());
-    for (int row = 0; row < height; ++row)
-        std::copy_n(labels.data() + row * width, width, regions.data() + teams.layout.cell(row, 0));
-    std::vector<Distance> distances(N * size), one;
-    std::vector<int> queue;
-    for (int i = 0; i < n; ++i) {
-        distances_to(grid_of(teams.layout, map.data()), teams.layout.cell(goals[2 * i], goals[2 * i + 1]), one, queue);
-        std::copy(one.begin(), one.end(), distances.begin() + i * size);
-    }
+        for (int col = 0; col < width; ++col) drawn[row * width + col] = grid.blocked[grid.layout.cell(row, col)];
+    std::vector<std::int32_t> starts(2 * N), ends(2 * N);
+    place_agents(grid, n, random, starts.data(), ends.data());
 
     Options options;
     options.fov_radius = radius;
@@ -72,22 +61,34 @@ void play(std::uint64_t seed) {
         if (random.below(2)) options.extras.push_back(static_cast<Channel>(channel));
     options.rewards = {1.0f, -1.0f, 0.5f, -0.5f, 3.0f, static_cast<float>(random.below(2))};
 
-    const std::int32_t team_size = n;
-    const std::uint64_t episode = seed;
-    const double comm_radius = connecting_radius(positions.data(), n, 0.5 + random.below(5));
+    options.comm_radius = 0.5 + random.below(5);
+    options.connected = random.below(2);
+
+    std::int32_t team_size = 0;
+    std::uint64_t episode = 0;
+    double comm_radius = 0.0;
     std::int64_t time = 0;
-    bool ended = false, terminated = false, truncated = false;
+    std::vector<T> map(size, T{1});
+    std::vector<std::int32_t> positions(2 * N), goals(2 * N), previous(2 * N), under_way(N), arrivals(N), regions(size, -1);
+    std::vector<Distance> distances(N * size);
+    std::unique_ptr<bool[]> cells_blocked(new bool[area]());
+    bool started = false, ended = true, terminated = false, truncated = false;
     std::vector<float> rewards(N), graph(N * N);
     std::unique_ptr<bool[]> replaced(new bool[N]()), arrived(new bool[N]()), on_goal(new bool[N]());
     std::vector<std::int8_t> mask(N * num_actions);
     const std::size_t side = 2 * radius + 3;
     std::vector<T> fov(N * (num_channels + options.extras.size()) * side * side);
+    teams.grids = cells_blocked.get(), teams.started = &started;
     teams.obstacles = map.data(), teams.team_sizes = &team_size, teams.seeds = &episode, teams.comm_radius = &comm_radius;
     teams.regions = regions.data(), teams.positions = positions.data(), teams.goals = goals.data();
     teams.previous = previous.data(), teams.under_way = under_way.data(), teams.arrivals = arrivals.data();
     teams.distances = distances.data(), teams.times = &time, teams.ended = &ended, teams.rewards = rewards.data();
     teams.terminated = &terminated, teams.truncated = &truncated, teams.replaced = replaced.get();
     teams.arrived = arrived.get(), teams.on_goal = on_goal.get(), teams.action_mask = mask.data();
+
+    begin_team(teams, options, 0, seed, case_of(teams, drawn.data(), starts.data(), ends.data(), n));
+    for (int i = 0; i < 2 * n; ++i) require(positions[i] == starts[i] && goals[i] == ends[i], "another case began", seed);
+    for (std::size_t i = 0; i < area; ++i) require(cells_blocked[i] == (drawn[i] != 0), "another map", seed);
 
     TeamScratch<T> scratch(teams.layout, static_cast<int>(N));
     std::vector<std::int64_t> actions(N);

@@ -1,0 +1,79 @@
+"""The processes that train one policy together, as torchrun starts them; one process alone is a team of one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import TypeVar
+
+import torch
+from torch import distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Ranks:
+    """This process among those that train together."""
+
+    rank: int = 0
+    """Its number; 0 writes the run folder and speaks to the user."""
+    count: int = 1
+    """How many there are, on all machines."""
+    local_count: int = 1
+    """How many there are on this machine."""
+
+    def share(self, name: str, total: int) -> int:
+        """The part of each process of `total`.
+
+        Raises:
+            ValueError: If it cannot be divided evenly.
+        """
+        if total % self.count:
+            raise ValueError(f"{name} must be a multiple of the {self.count} processes, got {total}")
+        return total // self.count
+
+    def gather(self, value: T) -> list[T]:
+        """The values of all processes, in their order."""
+        if self.count == 1:
+            return [value]
+        values: list[T | None] = [None] * self.count
+        distributed.all_gather_object(values, value)
+        return values  # pyright: ignore[reportReturnType]
+
+    def from_first(self, value: T) -> T:
+        """The value of process 0."""
+        if self.count == 1:
+            return value
+        values = [value]
+        distributed.broadcast_object_list(values)
+        return values[0]
+
+    def average(self, tensor: torch.Tensor) -> torch.Tensor:
+        """The mean over the processes, in place."""
+        if self.count > 1:
+            distributed.all_reduce(tensor)
+            tensor /= self.count
+        return tensor
+
+    def average_gradients(self, module: nn.Module) -> nn.Module:
+        """`module` whose backward pass averages gradients; batch norm's statistics follow those of process 0."""
+        return DistributedDataParallel(module) if self.count > 1 else module
+
+
+@contextmanager
+def join_ranks() -> Iterator[Ranks]:
+    """Meet the other processes that `torchrun` started, over gloo; alone without it."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield Ranks()
+        return
+    distributed.init_process_group("gloo", timeout=timedelta(hours=12))  # others wait while 0 validates
+    try:
+        local = int(os.environ["LOCAL_WORLD_SIZE"])
+        yield Ranks(distributed.get_rank(), distributed.get_world_size(), local)
+    finally:
+        distributed.destroy_process_group()

@@ -1,0 +1,138 @@
+"""Two processes that train one policy, as torchrun starts them."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from gnn_policy import PolicyConfig
+from gnn_policy.config import TrainConfig
+from gnn_policy.demonstrations import Demonstrations
+from gnn_policy.ranks import Ranks
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="gloo and POSIX signals")
+
+CONFIG = TrainConfig(
+    policy=PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=3.0),
+    num_agents=3,
+    height=6,
+    width=6,
+    train_maps=6,
+    cases_per_map=2,
+    validation_maps=3,
+    validation_cases_per_map=2,
+    test_maps=2,
+    epochs=3,
+    updates_per_epoch=3,
+    batch_size=8,
+    demonstration_steps=64,
+    dagger_every=1,
+    dagger_steps=32,
+    rollout_teams=4,
+    rollout_length=8,
+    validate_every=2,
+    threads=1,
+)
+
+WORKER = """
+import os, signal, sys
+from pathlib import Path
+import torch
+from rich.console import Console
+from gnn_policy import training
+from gnn_policy.config import TrainConfig
+from gnn_policy.progress import TrainingProgress
+from gnn_policy.ranks import join_ranks
+
+folder, victim, when = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+config = TrainConfig.load(Path(sys.argv[4]))
+
+class Progress(TrainingProgress):
+    def finished(self, row):
+        super().finished(row)
+        report = {name: t.clone() for name, t in run.policy.state_dict().items()}
+        report["demonstrations"] = torch.tensor([len(s) for s in run._shards])
+        report["loss"] = torch.tensor([row.loss, row.accuracy])
+        torch.save(report, folder.parent / f"{folder.name}-{ranks.rank}-{row.round}.pt")
+    def fitted(self, number, update, *rest):
+        if ranks.rank == victim and number == when and update == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+with join_ranks() as ranks:
+    run = training.Training(config, folder, Progress(config.epochs, Console(quiet=True)), ranks)
+    run.run()
+"""
+
+
+def launch(tmp_path, name, *, victim=-1, when=-1, config=CONFIG):
+    script = tmp_path / "worker.py"
+    script.write_text(WORKER)
+    config.save(tmp_path / "settings.json")
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    arguments = [str(tmp_path / name), str(victim), str(when), str(tmp_path / "settings.json")]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True, timeout=300)
+
+
+def report(tmp_path, name, rank, number):
+    return torch.load(tmp_path / f"{name}-{rank}-{number}.pt", weights_only=True)
+
+
+def assert_equal(one, two):
+    assert one.keys() == two.keys()
+    for name, tensor in one.items():
+        assert torch.equal(tensor, two[name]), name
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    home = tmp_path_factory.mktemp("ranks")
+    done = launch(home, "whole")
+    assert done.returncode == 0, done.stderr
+    return home
+
+
+def test_both_processes_hold_the_same_policy_and_data_after_every_round(whole):
+    for number in range(CONFIG.epochs):
+        assert_equal(report(whole, "whole", 0, number), report(whole, "whole", 1, number))
+    assert not torch.equal(report(whole, "whole", 0, 0)["head.weight"], report(whole, "whole", 0, 2)["head.weight"])
+
+
+def test_a_round_has_as_many_states_as_that_of_one_process_and_its_halves_differ(whole):
+    for number, steps in enumerate((64, 32, 32)):
+        states = Demonstrations.load(whole / "whole" / "demonstrations" / f"round_{number:04d}.safetensors")
+        assert len(states) == steps
+        half = steps // 2
+        assert states.positions[:half].tobytes() != states.positions[half:].tobytes()
+
+
+def test_the_state_and_the_best_policy_are_those_of_the_team(whole):
+    state = torch.load(whole / "whole" / "state.pt", weights_only=True)
+    assert state["processes"] == 2
+    last = report(whole, "whole", 1, CONFIG.epochs - 1)
+    assert all(torch.equal(tensor, last[name]) for name, tensor in state["policy"].items())
+    assert state["history"][-1]["samples"] == 3 * 3 * CONFIG.batch_size * CONFIG.num_agents
+
+
+@pytest.mark.parametrize(("victim", "when"), [(0, 1), (1, 2)])
+def test_a_run_of_which_a_process_is_killed_goes_on_to_the_same_end(whole, tmp_path, victim, when):
+    killed = launch(tmp_path, "torn", victim=victim, when=when)
+    assert killed.returncode != 0
+    assert (tmp_path / "torn" / "state.pt").exists()
+    assert not (tmp_path / f"torn-0-{when}.pt").exists()
+    again = launch(tmp_path, "torn")
+    assert again.returncode == 0, again.stderr
+    for rank in range(2):
+        assert_equal(report(tmp_path, "torn", rank, 2), report(whole, "whole", rank, 2))
+    states = [torch.load(home / "state.pt", weights_only=True) for home in (tmp_path / "torn", whole / "whole")]
+    assert states[0]["scheduler"] == states[1]["scheduler"]
+    for one, two in zip(*(state["optimizer"]["state"].values() for state in states), strict=True):
+        assert_equal(one, two)
+
+
+def test_what_cannot_be_shared_evenly_is_refused():
+    assert Ranks(1, 2).share("batch_size", 8) == 4
+    with pytest.raises(ValueError, match="batch_size must be a multiple of the 3 processes, got 8"):
+        Ranks(0, 3).share("batch_size", 8)
