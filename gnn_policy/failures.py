@@ -59,7 +59,7 @@ def failure(instance: Instance, solution: Solution) -> Failure | None:
 
 
 def _cut_off(
-    instance: Instance, cell: npt.NDArray[np.integer], goal: npt.NDArray[np.integer], resting: npt.NDArray[np.bool_]
+    instance: Instance, cell: npt.NDArray[np.int32], goal: npt.NDArray[np.int32], resting: npt.NDArray[np.bool_]
 ) -> bool:
     """Whether no way leads from the cell to the goal around the robots that rest on their goals."""
     blocked = instance.grid.copy()
