@@ -86,7 +86,7 @@ def test_the_code_blocks_run_one_after_another(
     instance = random_instance(height=16, width=16, num_agents=50, seed=0)
     save_map("FILE.map", instance.grid)
     save_scen("FILE.scen", instance, "FILE.map")
-    save_instances("SET.json", [instance, instance])
+    save_instances("SET.json", [random_instance(num_agents=4, seed=seed) for seed in range(4)])
     names: dict[str, object] = {}
     for language, block in blocks(page):
         if language == "python":
