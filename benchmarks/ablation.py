@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,6 +29,7 @@ from gnn_policy.evaluation import Estimate, Exam
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.rollout import Teams, rollout
 from gnn_policy.training import Training, split_cases
+from mapf_env import Solution
 from mapf_env.files import replacing, write_whole
 
 Variants = dict[str, dict[str, Any]]
@@ -216,36 +218,46 @@ def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
         actor = TeacherActor(teacher)
         played = rollout(actor, exam.instances, max_steps=exam.max_steps)
         solved = played.success
-        waits = moves = 0
-        for case in np.flatnonzero(solved):
-            solution = played.solutions[case]
-            under_way = np.arange(len(solution.paths) - 1)[:, None] < solution.arrivals
-            waits += int(((np.diff(solution.paths, axis=0) == 0).all(-1) & under_way).sum())
-            moves += int(under_way.sum())
         known[name] = {
             "solved": float(solved.mean()),
             "over_bound": float(played.flowtime[solved].sum() / bounds[solved].sum()),
             "makespan": float(played.makespan[solved].mean()),
-            "waits": waits / moves,
+            "waits": waiting([played.solutions[case] for case in np.flatnonzero(solved)]),
             "microseconds": teacher.seconds / actor.states * 1e6,
         }
         write_whole(file, json.dumps(known, indent=2) + "\n")
     return known
 
 
+def waiting(solutions: Sequence[Solution]) -> float:
+    """The share of waits among all moves before a robot's last arrival."""
+    waits = moves = 0
+    for solution in solutions:
+        under_way = np.arange(len(solution.paths) - 1)[:, None] < solution.arrivals
+        waits += int(((np.diff(solution.paths, axis=0) == 0).all(-1) & under_way).sum())
+        moves += int(under_way.sum())
+    return waits / max(moves, 1)
+
+
 def markdown(found: dict[tuple[str, int], dict[str, Any]], quality: dict[str, dict[str, float]]) -> str:
-    """One row for each run."""
-    headings = ["variant", "seed", "success, argmax", "flowtime increase", "label accuracy"]
+    """One row for each run; differences are to the default of the same seed, case by case."""
+    headings = ["variant", "seed", "success, argmax", "- default", "flowtime increase", "label accuracy"]
     if quality:
         headings += ["labels followed: solved", "flowtime / bound", "makespan", "waits", "us a label"]
-    headings += ["states", "training, s", "of it expert, s"]
+    headings += ["labelled states", "trained on", "training, s", "of it expert, s"]
     lines = ["| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
     for (name, seed), result in found.items():
-        success = Estimate.proportion(np.array(result["success"], np.bool_))
+        outcomes = np.array(result["success"], np.float64)
+        success, default = Estimate.proportion(outcomes > 0), found.get((DEFAULT, seed))
+        difference = ""
+        if default is not None and name != DEFAULT:
+            apart = Estimate.average(outcomes - np.array(default["success"]))
+            difference = f"{apart.mean:+.3f} ±{apart.high - apart.mean:.3f}"
         cells = [
             name,
             str(seed),
             f"{success.mean:.3f} [{success.low:.3f}, {success.high:.3f}]",
+            difference,
             f"{result['flowtime_increase']:+.1%}",
             f"{result['accuracy']:.3f}",
         ]
@@ -258,7 +270,8 @@ def markdown(found: dict[tuple[str, int], dict[str, Any]], quality: dict[str, di
                 f"{labels['waits']:.3f}",
                 f"{labels['microseconds']:.0f}",
             ]
-        cells += [f"{result['states']:,}", f"{result['seconds']:.0f}", f"{result['expert_seconds']:.1f}"]
+        cells += [f"{result['states']:,}", f"{result['samples'] / 1e6:.1f}M"]
+        cells += [f"{result['seconds']:.0f}", f"{result['expert_seconds']:.1f}"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 

@@ -179,7 +179,7 @@ def _own_solver(name: str) -> experts.Solver:
     if ":" not in name:
         raise ValueError(f"{wanted}; got {name!r}")
     try:
-        solver = pkgutil.resolve_name(name)
+        solver: Any = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as missing:
         raise ValueError(f"{wanted}; {name!r} cannot be found: {missing}") from None
     if not callable(solver):
