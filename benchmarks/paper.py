@@ -113,6 +113,7 @@ class Experiment:
 
     def __init__(self, options: Options, console: Console) -> None:
         self.options, self.console = options, console
+        self.variants = {variant.name: variant for variant in map(Execution.parse, options.rows)}
         self.models = [Model(N, K) for K in options.taps for N in options.train_on]
         self.scenes = [Scene(style, N) for style in options.styles for N in TEAMS]
         if options.large:
@@ -211,12 +212,9 @@ class Experiment:
 
     def _scores(self, model: Model, exam: evaluation.Exam) -> list[evaluation.Score]:
         policy = checkpoint.load(self.run_of(model))
-        variants = [Execution.parse(row) for row in self.options.rows]
         return [
-            evaluation.score(
-                variant.name, exam, rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(variant))
-            )
-            for variant in variants
+            evaluation.score(name, exam, rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(variant)))
+            for name, variant in self.variants.items()
         ]
 
     def _training_seconds(self, model: Model) -> float:
@@ -248,7 +246,7 @@ class Experiment:
         measures = (("success_rate", "success rate"), ("flowtime_increase", "flowtime increase"))
         for axes, (measure, label) in zip(panels, measures, strict=True):
             for taps in sorted(self.options.taps):
-                for row, line in zip(self.options.rows, ("-", "--", ":"), strict=False):
+                for row, line in zip(self.variants, ("-", "--", ":"), strict=False):
                     self._line(axes, style, taps, row, measure, line)
             axes.set(xlabel="robots, in training and test", ylabel=label, xticks=list(self.options.train_on))
             axes.grid(alpha=0.3)
@@ -280,12 +278,13 @@ class Experiment:
         )
 
     def _figure3(self, style: MapStyle) -> Figure:
-        ours = self._heat(style, self.options.rows[0])
+        first = next(iter(self.variants))
+        ours = self._heat(style, first)
         paper = np.array([PAPER[N] for N in PAPER])
         figure, panels = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
         pictures = (
             ("paper", paper, "viridis", 0.3, 1.0),
-            (f"here, {self.options.rows[0]}", ours, "viridis", 0.3, 1.0),
+            (f"here, {first}", ours, "viridis", 0.3, 1.0),
             ("difference", ours - paper, "RdYlGn", -0.3, 0.3),
         )
         for axes, (title, values, colours, low, high) in zip(panels, pictures, strict=True):
@@ -321,7 +320,7 @@ class Experiment:
     def _table(self, scenes: Sequence[Scene], measure: str) -> Iterator[str]:
         yield "| player | " + " | ".join(str(scene.num_agents) for scene in scenes) + " |"
         yield "|---|" + "---|" * len(scenes)
-        players = [(model.name, row) for model in self.models for row in self.options.rows]
+        players = [(model.name, row) for model in self.models for row in self.variants]
         baselines = [("baselines", row) for row in self._names_of_baselines(scenes)]
         for player, row in [*players, *baselines]:
             found = [self._row(scene, player, row) for scene in scenes]

@@ -15,7 +15,7 @@ from gnn_policy.network import DecentralizedPolicy, PolicyConfig
 from mapf_env.files import PathLike, replacing
 
 FORMAT = "mapf-env policy 1"
-PACKAGED = Path(__file__).with_name("weights") / "n10.safetensors"
+PACKAGED = Path(__file__).with_name("weights") / "n12.safetensors"
 """The policy that comes with the package; its card is weights/README.md."""
 
 

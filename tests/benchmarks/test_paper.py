@@ -1,0 +1,61 @@
+"""The paper's experiment does only what is not done, and its tables and figures say what was tested."""
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+PAPER = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "paper.py"))
+Experiment, Model, Options, Scene = (PAPER[name] for name in ("Experiment", "Model", "Options", "Scene"))
+
+
+def experiment(folder: Path, **changes: object):
+    options = {"folder": folder, "train_on": (4, 10), "styles": ("cells",), "cases_per_map": 1, "large": False}
+    return Experiment(Options(**{**options, **changes}), Console(quiet=True))
+
+
+def finish(whole, model, success: float = 0.5) -> None:
+    """Write what a training and a test of the model leave."""
+    whole.run_of(model).mkdir(parents=True)
+    (whole.run_of(model) / "results.json").write_text("{}")
+    estimate = {"mean": success, "low": success - 0.1, "high": success + 0.1}
+    measures = ("success_rate", "flowtime_increase", "flowtime_increase_solved", "makespan")
+    rows = [{"name": "argmax", **dict.fromkeys(measures, estimate)}]
+    path = whole._result(Scene("cells", model.num_agents), model.name)
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"rows": rows}))
+
+
+def test_figure_two_tests_every_k_on_its_own_size_and_figure_three_k_3_on_all(tmp_path):
+    pairs = {(scene.name, model.name) for scene, model in experiment(tmp_path)._pairs()}
+    own = {(f"20x20-cells-n{N}", f"n{N}-k{K}") for N in (4, 10) for K in (1, 2, 3)}
+    general = {(f"20x20-cells-n{N}", f"n{M}-k3") for N in (4, 6, 8, 10, 12, 14) for M in (4, 10)}
+    assert pairs == own | general
+    large = {(scene.name, model.name) for scene, model in experiment(tmp_path, large=True)._pairs()} - pairs
+    assert large == {(f"50x50-cells-n{N}", "n10-k3") for N in (20, 40, 60)}
+
+
+def test_only_what_is_missing_is_trained(tmp_path, monkeypatch):
+    whole, trained = experiment(tmp_path, taps=(3,)), []
+    finish(whole, Model(4, 3))
+    monkeypatch.setattr("subprocess.run", lambda command, check: trained.append(command))
+    whole.train()
+    (command,) = trained
+    assert command[1:5] == ["-m", "gnn_policy.train", "--recipe", "full"]
+    assert command[command.index("--num-agents") + 1] == "10"
+    assert command[command.index("--run") + 1] == str(tmp_path / "n10-k3")
+
+
+def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
+    whole = experiment(tmp_path)
+    finish(whole, Model(10, 3), success=0.75)
+    whole.draw()
+    text = (tmp_path / "results.md").read_text()
+    assert "| n10-k3 argmax |  |  |  | 0.750 [0.650, 0.850] |  |  |" in text
+    assert "| paper, trained on 10 | 0.965 | 0.952 | 0.925 | 0.898 | 0.854 | 0.814 |" in text
+    assert "n4-k3" not in text
+    assert whole._heat("cells", "argmax")[3, 3] == pytest.approx(0.75)
+    for picture in ("figure2-cells.png", "figure3-cells.png"):
+        assert (tmp_path / picture).read_bytes()[:4] == b"\x89PNG"
