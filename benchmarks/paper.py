@@ -71,6 +71,8 @@ class Options:
     """How the policies are executed, as in gnn_policy.evaluate."""
     cases_per_map: int = 50
     """Test cases on each of 90 maps."""
+    large: bool = True
+    """Test models of 10 and more robots on the paper's maps of 50x50 as well, where teams have 20, 40 and 60."""
     threads: int = 1
     """CPU threads of training, testing and the expert."""
 
@@ -113,7 +115,8 @@ class Experiment:
         self.options, self.console = options, console
         self.models = [Model(N, K) for K in options.taps for N in options.train_on]
         self.scenes = [Scene(style, N) for style in options.styles for N in TEAMS]
-        self.scenes += [Scene(style, N, size) for style in options.styles for size, N in LARGE]
+        if options.large:
+            self.scenes += [Scene(style, N, size) for style in options.styles for size, N in LARGE]
 
     def plan(self) -> None:
         """Say what is to do and how long it takes on this machine."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import date
 from html import escape
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 import tyro
@@ -163,7 +163,7 @@ def against_robots(runs: Sequence[Run]) -> str:
 def heat_maps(runs: Sequence[Run]) -> str:
     """Success of the first way of execution, training teams by test teams, and the paper's."""
     ours = {run.trained_on: dict(run.estimates(run.rows()[0], "success_rate")) for run in runs}
-    paper = {size: dict(zip(TEAMS, row, strict=True)) for size, row in PAPER.items()}
+    paper: dict[int, dict[int, float]] = {size: dict(zip(TEAMS, row, strict=True)) for size, row in PAPER.items()}
     columns = sorted({size for row in (*ours.values(), *paper.values()) for size in row})
     sizes = sorted({*ours, *paper})
     return side_by_side(
@@ -214,7 +214,7 @@ def side_by_side(*diagrams: Axes) -> str:
     pictures = []
     for diagram in diagrams:
         file = io.StringIO()
-        diagram.figure.savefig(file, format="svg", metadata={"Date": None})
+        cast(Figure, diagram.figure).savefig(file, format="svg", metadata={"Date": None})
         pictures.append(file.getvalue()[file.getvalue().index("<svg") :])
     return f"<section>{''.join(pictures)}</section>"
 

@@ -181,8 +181,8 @@ def compiled_bare_loop() -> Path:
 def threads_table(options: Options, program: Path | None) -> Table:
     """Two threads beside one, by wall-clock time, and a thousand robots on a large map beside the largest team.
 
-    The environments take turns of some milliseconds, and the best turn of each counts. A worker sleeps while it is not
-    its environment's turn; short turns would measure how it is woken.
+    The environments take turns of some milliseconds, and the best turn of each counts. Ratios have differed between
+    runs of one commit: run it more than once.
     """
     turn_steps = 128
     largest = max(options.num_agents)

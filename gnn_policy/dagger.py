@@ -11,7 +11,7 @@ import math
 import pkgutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -184,7 +184,7 @@ def _own_solver(name: str) -> experts.Solver:
         raise ValueError(f"{wanted}; {name!r} cannot be found: {missing}") from None
     if not callable(solver):
         raise ValueError(f"{wanted}; {name!r} is no function but {type(solver).__name__}")
-    return solver
+    return cast(experts.Solver, solver)
 
 
 class Mixture(TensorDictModuleBase):

@@ -59,12 +59,12 @@ def failure(instance: Instance, solution: Solution) -> Failure | None:
 
 
 def _cut_off(
-    instance: Instance, cell: npt.NDArray[np.integer], goal: npt.NDArray[np.integer], resting: npt.NDArray[np.bool_]
+    instance: Instance, cell: npt.NDArray[np.int32], goal: npt.NDArray[np.int32], resting: npt.NDArray[np.bool_]
 ) -> bool:
     """Whether no way leads from the cell to the goal around the robots that rest on their goals."""
     blocked = instance.grid.copy()
     blocked[tuple(instance.goals[resting].T)] = True
-    return bool(_native.distances(blocked, goal[None])[0, cell[0], cell[1]] < 0)
+    return bool(_native.distances(blocked, goal[None].astype(np.int32))[0, cell[0], cell[1]] < 0)
 
 
 def count_failures(played: Rollouts) -> dict[Failure, int]:

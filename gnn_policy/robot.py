@@ -112,7 +112,7 @@ class Robot:
             raise RuntimeError(f"there are {self.rounds} rounds in a step: begin() the next step or act()")
         return Message(self._scaled(self._gathered[-1]), self._stuck)
 
-    def hear(self, messages: Mapping[Hashable, Message]) -> None:
+    def hear(self, messages: Mapping[Any, Message]) -> None:
         """Take the messages that the neighbours sent in this round.
 
         Raises:

@@ -21,7 +21,7 @@ import pytest
 
 from experts import command as experts_command
 from gnn_policy import evaluate, play, train
-from mapf_env import random_instance, save_map, save_scen
+from mapf_env import random_instance, save_instances, save_map, save_scen
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -86,6 +86,7 @@ def test_the_code_blocks_run_one_after_another(
     instance = random_instance(height=16, width=16, num_agents=50, seed=0)
     save_map("FILE.map", instance.grid)
     save_scen("FILE.scen", instance, "FILE.map")
+    save_instances("SET.json", [random_instance(num_agents=4, seed=seed) for seed in range(4)])
     names: dict[str, object] = {}
     for language, block in blocks(page):
         if language == "python":

@@ -63,7 +63,7 @@ inline void observe_team(const Layout& layout, const T* obstacles, const std::in
         std::fill_n(out + plane, plane, T{0});
         out[plane + goal_index(goals[2 * i] - row, goals[2 * i + 1] - col, radius)] = T{1};
     }
-    // The marks are read last: by now they have left the queue of writes, where wide reads would wait for them.
+    // In a pass of its own, which was measured to be faster.
     out -= num_agents * num_planes * plane;
     for (int i = 0; i < num_agents; ++i, out += num_planes * plane) {
         const int corner = layout.cell(positions[2 * i] - radius, positions[2 * i + 1] - radius);

@@ -112,7 +112,7 @@ def test_the_page_plays_pauses_scrubs_and_tells_what_a_robot_knows(tmp_path: Pat
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
 def test_scenes_are_chosen_and_their_solutions_share_a_clock(tmp_path: Path) -> None:
     alone = Instance(np.zeros((1, 3), bool), [[0, 0]], [[0, 2]])
-    drive, rest = Solution([[[0, 0]], [[0, 1]], [[0, 2]]]), Solution([[[0, 0]], [[0, 1]], [[0, 1]], [[0, 1]], [[0, 1]]])
+    drive, rest = (Solution(np.array([[[0, col]] for col in cols])) for cols in ([0, 1, 2], [0, 1, 1, 1, 1]))
     scenes = [
         Scene("first", alone, {"policy": rest}),
         Scene("second", alone, {"policy": rest, "expert": drive}),
