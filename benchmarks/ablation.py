@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -156,7 +157,7 @@ def train(options: Options, name: str, config: TrainConfig, console: Console) ->
 
 
 def run_folder(runs: Path, name: str, seed: int) -> Path:
-    return runs / f"{name.replace(' ', '-').replace('=', '').replace(',', '')}-seed{seed}"
+    return runs / re.sub(r"[^\w.]+", "-", f"{name} seed {seed}")
 
 
 def outcome(runs: Path, name: str, seed: int) -> dict[str, Any] | None:
