@@ -9,7 +9,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-UPDATES = 400
+UPDATES = 200
 SETTINGS = f"""
     --epochs 1 --updates-per-epoch {UPDATES} --train-maps 100 --validation-maps 1 --validation-cases-per-map 1
     --test-maps 1 --cases-per-map 1 --demonstration-steps 8192 --dagger-every 0
