@@ -166,8 +166,10 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         Raises:
             RuntimeError: Before the first reset or after the end of the episode.
             ValueError: If agents are missing or unknown, or an action is out of range.
-            TypeError: If an action is not an integer.
+            TypeError: If `actions` is no dictionary, or an action is not an integer.
         """
+        if not isinstance(actions, dict):
+            raise TypeError(f"actions must be a dictionary of one action for each agent, got {type(actions).__name__}")
         agents = self.agents
         if not agents:
             raise RuntimeError("the episode has not begun or has ended: call reset() before step()")

@@ -197,6 +197,8 @@ def test_bad_calls_are_refused() -> None:
         env.step({"agent_0": 4, "agent_9": 4})
     with pytest.raises(ValueError, match=r"action 5 of agent 1 .* is none of 0\.\.4 \(up, left, down, right, idle\)"):
         env.step({"agent_0": 4, "agent_1": 5})
+    with pytest.raises(TypeError, match="actions must be a dictionary of one action for each agent, got list"):
+        env.step([4, 4])  # pyright: ignore[reportArgumentType]
     for action in (1.0, None, "up"):
         with pytest.raises(TypeError, match="the action of agent_1 must be an integer"):
             env.step({"agent_0": 4, "agent_1": action})  # pyright: ignore[reportArgumentType]
