@@ -7,8 +7,9 @@
     python benchmarks/paper.py draw     figures and tables of what has been tested
 
 Figure 2 is success and flowtime increase of models tested on teams of the size they were trained on, for K = 1, 2 and
-3; figure 3 tests every model with K = 3 on every size. Each finished model and each tested pair is a file; whatever is
-there is not done again.
+3; figure 3 tests every model with K = 3 on every size. All models see equally many robot states. Beyond the paper there
+are models for teams whose radius grows until they are connected, and one that knows the map and is trained under the
+PIBT shield. Each finished model and each tested pair is a file; whatever is there is not done again.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from gnn_policy import checkpoint, evaluation
-from gnn_policy.config import RECIPES
+from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.network import DecentralizedPolicy, PolicyConfig
 from gnn_policy.rollout import rollout
@@ -41,6 +42,7 @@ from mapf_env.files import replacing, write_whole
 from mapf_env.generation import MapStyle
 
 Step = Literal["all", "plan", "train", "test", "draw"]
+Kind = Literal["paper", "connected", "informed"]
 
 TEAMS = (4, 6, 8, 10, 12, 14)
 PAPER = {
@@ -51,6 +53,8 @@ PAPER = {
     12: (0.9696, 0.9542, 0.9347, 0.9082, 0.8791, 0.8302),
 }
 """Figure 3 of the paper: success rate, a row for each size of the training teams, a column for each of TEAMS."""
+W = 1.05
+"""Of the expert whose makespans set T_max and whose flowtimes are compared with."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,9 @@ class Options:
     """Sizes of the training teams."""
     taps: tuple[int, ...] = (3, 2, 1)
     """Filter taps K of the models; K = 1 does not communicate."""
+    kinds: tuple[Kind, ...] = ("paper", "connected", "informed")
+    """Models after the "paper"; and of the largest training team those with a radius that grows until the team is
+    "connected", K > 1, and one "informed" by a channel of the cost to go and trained under the PIBT shield, K = 3."""
     styles: tuple[MapStyle, ...] = ("cells", "walls")
     """Styles of the test maps, a table each."""
     rows: tuple[str, ...] = ("argmax", "stuck", "sampled")
@@ -83,11 +90,32 @@ class Model:
 
     num_agents: int
     taps: int
+    kind: Kind = "paper"
 
     @property
     def name(self) -> str:
         """The name of its run folder."""
-        return f"n{self.num_agents}-k{self.taps}"
+        return f"n{self.num_agents}-k{self.taps}" + (f"-{self.kind}" if self.kind != "paper" else "")
+
+    @property
+    def config(self) -> TrainConfig:
+        """Its settings: the recipe "full", in which a round has as many robot states for each size of the team."""
+        full, N = RECIPES["full"], self.num_agents
+        informed = self.kind == "informed"
+        counts = ("batch_size", "demonstration_steps", "dagger_steps", "fresh_window")
+        return replace(
+            full,
+            policy=replace(
+                full.policy,
+                taps=self.taps,
+                comm_range="connected" if self.kind == "connected" else "fixed",
+                cost_to_go=informed,
+            ),
+            num_agents=N,
+            shield="pibt" if informed else "idle",
+            test_maps=1,  # the test is this program's
+            **{name: getattr(full, name) * max(PAPER) // N for name in counts},
+        )
 
 
 @dataclass(frozen=True)
@@ -114,7 +142,8 @@ class Experiment:
     def __init__(self, options: Options, console: Console) -> None:
         self.options, self.console = options, console
         self.variants = {variant.name: variant for variant in map(Execution.parse, options.rows)}
-        self.models = [Model(N, K) for K in options.taps for N in options.train_on]
+        self.models = [Model(N, K, kind) for kind in options.kinds for K in options.taps for N in options.train_on]
+        self.models = [model for model in self.models if self._wanted(model)]
         self.scenes = [Scene(style, N) for style in options.styles for N in TEAMS]
         if options.large:
             self.scenes += [Scene(style, N, size) for style in options.styles for size, N in LARGE]
@@ -136,9 +165,8 @@ class Experiment:
             if self.is_trained(model):
                 continue
             self.console.rule(f"training on {model.num_agents} robots, K = {model.taps}")
-            command = [sys.executable, "-m", "gnn_policy.train", "--recipe", "full", "--threads"]
-            command += [str(self.options.threads), "--num-agents", str(model.num_agents)]
-            command += ["--policy.taps", str(model.taps), "--run", str(self.run_of(model))]
+            command = [sys.executable, "-m", "gnn_policy.train", "--run", str(self.run_of(model))]
+            command += ["--recipe", "full", "--threads", str(self.options.threads), *_arguments(model.config)]
             subprocess.run(command, check=True)
 
     def test(self) -> None:
@@ -187,6 +215,14 @@ class Experiment:
         """Whether its training has come to its end."""
         return (self.run_of(model) / "results.json").exists()
 
+    @staticmethod
+    def _wanted(model: Model) -> bool:
+        return (
+            model.kind == "paper"
+            or (model.num_agents == max(PAPER) and model.taps == 3)
+            or (model.num_agents == max(PAPER) and model.taps > 1 and model.kind == "connected")
+        )
+
     def _pairs(self) -> Iterator[tuple[Scene, Model]]:
         """Which model is tested where."""
         for scene in self.scenes:
@@ -208,7 +244,7 @@ class Experiment:
             cases_per_map=self.options.cases_per_map,
         )
         cases = split_cases(config, "test", scene.num_agents)
-        return evaluation.Exam.prepare(cases, w=config.w, timeout=config.timeout, threads=self.options.threads)
+        return evaluation.Exam.prepare(cases, w=W, timeout=config.timeout, threads=self.options.threads)
 
     def _scores(self, model: Model, exam: evaluation.Exam) -> list[evaluation.Score]:
         policy = checkpoint.load(self.run_of(model))
@@ -338,6 +374,17 @@ class Experiment:
             if path.exists():
                 return [row["name"] for row in json.loads(path.read_text())["rows"]]
         return []
+
+
+def _arguments(config: TrainConfig) -> list[str]:
+    """What the command line of training says to get these settings from the recipe "full"."""
+    words = []
+    for prefix, mine, recipe in (("", config, RECIPES["full"]), ("policy.", config.policy, RECIPES["full"].policy)):
+        for name, value in asdict(mine).items():
+            if name != "policy" and value != getattr(recipe, name):
+                option = f"--{prefix}{name}".replace("_", "-")
+                words += [option] if value is True else [option, str(value)]
+    return words
 
 
 def _cell(estimate: dict[str, float | None]) -> str:

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from gnn_policy.cases import Split
+from gnn_policy.execution import Shield
 from gnn_policy.network import PolicyConfig
+from gnn_policy.precision import Precision
 from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
@@ -84,6 +86,9 @@ class TrainConfig:
     """Steps that a team plays in a round."""
     rollout_teams: int = 128
     """Teams that play side by side."""
+    shield: Shield = "idle"
+    """Under which aggregated rollouts and validation play: the paper's "idle", or "pibt", which takes the logits as
+    preferences."""
     sample_rollouts: bool = False
     """Draw the moves of aggregated rollouts from the softmax in place of the most probable ones."""
     augment: bool = False
@@ -106,6 +111,9 @@ class TrainConfig:
     """Of the maps and cases of all three splits."""
     threads: int = 0
     """CPU threads; 0 takes all that the process may use."""
+    precision: Precision = "auto"
+    """In which numbers the network computes in training: "bfloat16", "float32", or "auto", the first where the
+    hardware has it."""
     device: str = "cpu"
     """Where the network lives."""
 
@@ -124,7 +132,12 @@ class TrainConfig:
         for name in ("beta_decay", "fresh_share", "beta1"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
-        for name, choices in (("robot_order", get_args(RobotOrder)), ("aggregation", get_args(Aggregation))):
+        for name, choices in (
+            ("robot_order", get_args(RobotOrder)),
+            ("aggregation", get_args(Aggregation)),
+            ("shield", get_args(Shield)),
+            ("precision", get_args(Precision)),
+        ):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
         for name in ("seed", "data_seed"):
@@ -201,7 +214,7 @@ RECIPES: dict[Recipe, TrainConfig] = {
         styles=("cells", "walls"),
         train_maps=4000,
         cases_per_map=20,
-        validation_cases_per_map=10,
+        w=1.0,
         epochs=60,
         validate_every=10,
     ),

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch.nn.functional import one_hot
 from torchrl.collectors import Collector
 
 import experts
@@ -25,6 +26,7 @@ from experts.many import SOLVER_NAMES
 from gnn_policy.config import RobotOrder, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.precision import autocast
 from gnn_policy.ranks import Ranks
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
 from mapf_env import Action, Instance, Solution, _native
@@ -188,11 +190,14 @@ def _own_solver(name: str) -> experts.Solver:
 
 
 class Mixture(TensorDictModuleBase):
-    """In each step a team follows the expert with probability `beta`, else the policy."""
+    """In each step a team follows the expert with probability `beta`, else the policy.
 
-    def __init__(self, policy: DecentralizedPolicy, teacher: Teacher, *, sample: bool) -> None:
+    Under the shield "pibt" an action is a value for each move: the policy's logits, or 1 for the expert's move.
+    """
+
+    def __init__(self, policy: DecentralizedPolicy, teacher: Teacher, config: TrainConfig) -> None:
         super().__init__()
-        self.policy, self.teacher, self.sample = policy, teacher, sample
+        self.policy, self.teacher, self.config = policy, teacher, config
         self.in_keys = [FOV, GRAPH, POSITIONS, CASE]  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = [ACTION]  # pyright: ignore[reportAttributeAccessIssue]
         self.beta = 1.0
@@ -204,19 +209,17 @@ class Mixture(TensorDictModuleBase):
         teams = tensordict.batch_size[0]
         by_expert = torch.rand(teams, generator=self.random) < self.beta
         positions = tensordict[POSITIONS]
-        actions = torch.empty(positions.shape[:2], dtype=torch.int64)
+        values = torch.empty(*positions.shape[:2], len(Action))
         if not by_expert.all():
             device = self.policy.head.weight.device
-            logits = self.policy(tensordict[FOV].to(device), tensordict[GRAPH].to(device)).cpu()
-            actions = self._sampled(logits) if self.sample else logits.argmax(-1)
+            with autocast(self.config.precision, device):
+                values = self.policy(tensordict[FOV].to(device), tensordict[GRAPH].to(device)).float().cpu()
+            if self.config.sample_rollouts:  # the greatest of the logits with Gumbel noise is a draw from the softmax
+                values -= torch.empty_like(values).exponential_(generator=self.random).log()
         if by_expert.any():
             moves, _ = self.teacher.moves(np.asarray(tensordict[CASE][by_expert]), np.asarray(positions[by_expert]))
-            actions[by_expert] = torch.from_numpy(moves.astype(np.int64))
-        return tensordict.set(ACTION, actions)
-
-    def _sampled(self, logits: torch.Tensor) -> torch.Tensor:
-        probabilities = torch.softmax(logits, -1).flatten(0, 1)
-        return torch.multinomial(probabilities, 1, generator=self.random).view(logits.shape[:2])
+            values[by_expert] = one_hot(torch.from_numpy(moves.astype(np.int64)), len(Action)).float()
+        return tensordict.set(ACTION, values if self.config.shield == "pibt" else values.argmax(-1))
 
 
 class Aggregator:
@@ -232,7 +235,7 @@ class Aggregator:
     ) -> None:
         self._config, self._teacher, self._rank = config, teacher, ranks.rank
         self._teams = ranks.share("rollout_teams", config.rollout_teams)
-        self._mixture = Mixture(policy, teacher, sample=config.sample_rollouts)
+        self._mixture = Mixture(policy, teacher, config)
         self._env = TeamEnv(
             self._teams,
             instances,
@@ -241,6 +244,7 @@ class Aggregator:
             comm_radius=config.policy.comm_radius,
             comm_range=config.policy.comm_range,
             comm_weights=config.policy.comm_weights,
+            shield=config.shield,
             max_cycles=config.rollout_length,
             dtype="uint8",
         )

@@ -26,7 +26,7 @@ class ImitationLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss of a batch of team states."""
-        logits = self.policy(tensordict[FOV], tensordict[GRAPH]).flatten(0, 1)
+        logits = self.policy(tensordict[FOV], tensordict[GRAPH]).flatten(0, 1).float()
         labels = tensordict[EXPERT_ACTION].flatten()
         loss = torch.nn.functional.cross_entropy(logits, labels)
         accuracy = (logits.detach().argmax(-1) == labels).float().mean()

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
+from gnn_policy.convolution import StridedConvolution
 from mapf_env import Action
 
 CommRange = Literal["fixed", "connected"]
@@ -21,7 +22,7 @@ class PolicyConfig:
 
     encoder: Literal["released", "lean"] = "released"
     """CNN that reads a view: "released" is that of the paper's released code (5 convolutions, 3 poolings), "lean" has
-    3 strided convolutions and costs half."""
+    3 convolutions without poolings and costs a third."""
     features: int = 128
     """Features F that a robot extracts and communicates."""
     taps: int = 3
@@ -75,20 +76,23 @@ def released_encoder(channels: int, side: int, features: int) -> nn.Sequential:
 
 
 def lean_encoder(channels: int, side: int, features: int) -> nn.Sequential:
-    """Three strided convolutions for views (M, channels, side, side), to (M, features)."""
+    """Three convolutions for views (M, channels, side, side), to (M, features)."""
     side = ((side + 1) // 2 + 1) // 2
+    kernel = min(3, side)
+    # Where the last kernel covers all that is left, a convolution is a matrix product.
+    last = [nn.Flatten(), nn.Linear(64 * side * side, 128)] if kernel == side else [nn.Conv2d(64, 128, kernel)]
     return nn.Sequential(
-        nn.Conv2d(channels, 48, 3, stride=2, padding=1),
+        StridedConvolution(channels, 48),
         nn.BatchNorm2d(48),
         nn.ReLU(),
-        nn.Conv2d(48, 64, 3, stride=2, padding=1),
+        StridedConvolution(48, 64),
         nn.BatchNorm2d(64),
         nn.ReLU(),
-        nn.Conv2d(64, 128, min(3, side)),
-        nn.BatchNorm2d(128),
+        *last,
+        nn.BatchNorm1d(128) if kernel == side else nn.BatchNorm2d(128),
         nn.ReLU(),
         nn.Flatten(),
-        nn.Linear(128 * max(side - 2, 1) ** 2, features),
+        nn.Linear(128 * (side - kernel + 1) ** 2, features),
         nn.ReLU(),
     )
 

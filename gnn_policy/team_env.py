@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from mapf_env import BatchedEnv, Instance, Observation
+from mapf_env import Action, BatchedEnv, Instance, Observation
 
 FOV = ("agents", "fov")
 GRAPH = ("agents", "graph")
@@ -25,8 +25,9 @@ ENDS = ("done", "terminated", "truncated")
 class TeamEnv(EnvBase):
     """B teams as one TorchRL environment of batch size [B], over `mapf_env.BatchedEnv`.
 
-    It reads `ACTION` (B, N) and writes `FOV` (B, N, C, F, F), `GRAPH` (B, N, N), `POSITIONS` (B, N, 2), `REWARD`
-    (B, N, 1) and `CASE` (B,): which of `cases` a team plays, -1 for a random instance.
+    It reads `ACTION` (B, N), under the shield "pibt" a value for each of the moves (B, N, 5), and writes `FOV`
+    (B, N, C, F, F), `GRAPH` (B, N, N), `POSITIONS` (B, N, 2), `REWARD` (B, N, 1) and `CASE` (B,): which of `cases` a
+    team plays, -1 for a random instance.
 
     Args:
         num_envs: The number of teams B.
@@ -66,9 +67,12 @@ class TeamEnv(EnvBase):
             case=Unbounded(teams, dtype=torch.int64),
             shape=teams,
         )
-        self.action_spec = Composite(
-            agents=Composite(action=Categorical(5, robots, dtype=torch.int64), shape=teams), shape=teams
+        action = (
+            Unbounded(torch.Size([*robots, len(Action)]), dtype=torch.float32)
+            if config.shield == "pibt"
+            else Categorical(len(Action), robots, dtype=torch.int64)
         )
+        self.action_spec = Composite(agents=Composite(action=action, shape=teams), shape=teams)
         self.reward_spec = Composite(
             agents=Composite(reward=Unbounded(torch.Size([*robots, 1]), dtype=torch.float32), shape=teams), shape=teams
         )

@@ -39,6 +39,7 @@ from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.imitation import ImitationLoss
 from gnn_policy.learning_curve import Round, draw_learning_curve
 from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.precision import autocast
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.ranks import Ranks
 from gnn_policy.rollout import rollout
@@ -240,7 +241,8 @@ class Training:
         for update, chosen in enumerate(draws):
             own = chosen[self.ranks.rank :: self.ranks.count]
             batch = batches.batch(demonstrations, own, rng).to(config.device)
-            outcome = self.loss(batch)
+            with autocast(config.precision, batch.device):
+                outcome = self.loss(batch)
             self.optimizer.zero_grad()
             outcome["loss_imitation"].backward()
             self.optimizer.step()
@@ -266,7 +268,13 @@ class Training:
         return list(rng.integers(first, size, (config.updates_per_epoch or 0, config.batch_size)))
 
     def _validate(self, row: Round, exam: evaluation.Exam) -> None:
-        played = rollout(self.policy, exam.instances, max_steps=exam.max_steps, seed=self.config.seed)
+        played = rollout(
+            self.policy,
+            exam.instances,
+            shield=self.config.shield,
+            max_steps=exam.max_steps,
+            seed=self.config.seed,
+        )
         result = evaluation.score("validation", exam, played)
         row.validation_success = result.success_rate.mean
         row.validation_flowtime_increase = result.flowtime_increase.mean

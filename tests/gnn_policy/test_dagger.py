@@ -99,7 +99,7 @@ def test_round_zero_is_the_expert_itself(cases, policy):
 
 
 def test_every_team_reaches_its_goals_under_the_expert(cases, policy):
-    mixture = Mixture(policy, taught_by(cases), sample=False)
+    mixture = Mixture(policy, taught_by(cases), CONFIG)
     env = TeamEnv(len(cases), cases, max_cycles=60, fov_radius=2, dtype="uint8")
     state, reached = env.reset(seed=0), set()
     for _ in range(60):
@@ -186,7 +186,7 @@ def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
     with torch.no_grad():
         policy.head.weight.zero_()
         policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))  # this policy always stays
-    mixture = Mixture(policy.eval(), taught_by(cases), sample=False)
+    mixture = Mixture(policy.eval(), taught_by(cases), CONFIG)
     mixture.beta = beta
     mixture.random.manual_seed(0)
     state = states_at_starts(cases, 2000)
@@ -201,7 +201,7 @@ def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
 
 def test_sampled_moves_follow_the_softmax(cases, policy):
     policy.eval()
-    mixture = Mixture(policy, taught_by(cases), sample=True)
+    mixture = Mixture(policy, taught_by(cases), replace(CONFIG, sample_rollouts=True))
     mixture.beta = 0.0
     state = states_at_starts(cases, 1).expand(4000).contiguous()
     moves = mixture(state)[ACTION].numpy()
@@ -398,7 +398,7 @@ def test_round_zero_imitates_whatever_is_aggregated_later(cases, policy):
 
 
 def test_the_mixture_reads_what_the_environment_writes(policy, cases):
-    mixture = Mixture(policy, taught_by(cases), sample=False)
+    mixture = Mixture(policy, taught_by(cases), CONFIG)
     state = TeamEnv(2, cases).reset()
     assert isinstance(state, TensorDict)
     assert set(mixture.in_keys) <= set(state.keys(include_nested=True))
