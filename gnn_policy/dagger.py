@@ -203,7 +203,7 @@ class Mixture(TensorDictModuleBase):
         self.beta = 1.0
         self.random = torch.Generator()
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the joint actions (B, N)."""
         teams = tensordict.batch_size[0]

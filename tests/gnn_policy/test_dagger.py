@@ -98,9 +98,10 @@ def test_round_zero_is_the_expert_itself(cases, policy):
     assert cut_off <= 5 * 3, "more teams broke off than the ends of three batches explain"
 
 
-def test_every_team_reaches_its_goals_under_the_expert(cases, policy):
-    mixture = Mixture(policy, taught_by(cases), CONFIG)
-    env = TeamEnv(len(cases), cases, max_cycles=60, fov_radius=2, dtype="uint8")
+@pytest.mark.parametrize("shield", ["idle", "pibt"])
+def test_every_team_reaches_its_goals_under_the_expert(cases, policy, shield):
+    mixture = Mixture(policy, taught_by(cases), replace(CONFIG, shield=shield))
+    env = TeamEnv(len(cases), cases, max_cycles=60, fov_radius=2, dtype="uint8", shield=shield)
     state, reached = env.reset(seed=0), set()
     for _ in range(60):
         both, state = env.step_and_maybe_reset(mixture(state))
@@ -209,6 +210,15 @@ def test_sampled_moves_follow_the_softmax(cases, policy):
         shares = torch.softmax(policy(state[FOV][:1], state[GRAPH][:1]), -1)[0].numpy()
     counted = np.stack([(moves == action).mean(axis=0) for action in range(5)], -1)
     np.testing.assert_allclose(counted, shares, atol=0.04)
+
+
+def test_under_pibt_the_policys_values_are_its_logits(cases, policy):
+    mixture = Mixture(policy.eval(), taught_by(cases), replace(CONFIG, shield="pibt", precision="float32"))
+    mixture.beta = 0.0
+    state = states_at_starts(cases, 8)
+    values = mixture(state)[ACTION]
+    with torch.no_grad():
+        torch.testing.assert_close(values, policy(state[FOV], state[GRAPH]))
 
 
 def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
