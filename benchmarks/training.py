@@ -99,7 +99,9 @@ def forward_pass(policy: DecentralizedPolicy, config: TrainConfig) -> Callable[[
 
 def environment_step(config: TrainConfig) -> Callable[[], None]:
     """The environment's part of it."""
-    teams = BatchedEnv(config.rollout_teams, num_agents=config.num_agents, dtype="uint8", autoreset=AutoresetMode.NEXT_STEP)
+    teams = BatchedEnv(
+        config.rollout_teams, num_agents=config.num_agents, dtype="uint8", autoreset=AutoresetMode.NEXT_STEP
+    )
     teams.reset(0)
     actions = np.random.default_rng(0).integers(0, 5, (config.rollout_teams, config.num_agents))
     return lambda: teams.step(actions) and None
