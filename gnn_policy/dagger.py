@@ -8,6 +8,7 @@ that of the paper's released code.
 from __future__ import annotations
 
 import functools
+import importlib.util
 import math
 import pkgutil
 import time
@@ -20,11 +21,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch.nn.functional import one_hot
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 
 import experts
 from experts.many import SOLVER_NAMES
-from gnn_policy.config import RobotOrder, TrainConfig
+from gnn_policy.config import Backend, RobotOrder, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
@@ -196,6 +197,9 @@ class Mixture(TensorDictModuleBase):
     Under the shield "pibt" an action is a value for each move: the policy's logits, or 1 for the expert's move.
     """
 
+    beta: torch.Tensor
+    seed: torch.Tensor
+
     def __init__(self, policy: DecentralizedPolicy, teacher: Teacher, config: TrainConfig) -> None:
         super().__init__()
         self.policy, self.teacher, self.config = policy, teacher, config
@@ -234,6 +238,23 @@ class Mixture(TensorDictModuleBase):
         return tensordict.set(ACTION, values if self.config.shield == "pibt" else values.argmax(-1))
 
 
+def _collector(
+    backend: Backend, players: int, make_env: Callable[[], TeamEnv], mixture: Mixture, **settings: Any
+) -> BaseCollector:
+    """TorchRL's collector in this process, or in as many others as there are players."""
+    own: dict[str, Any] = {"compact_obs": True, "auto_register_policy_transforms": False}
+    if backend == "direct":
+        return Collector(make_env(), mixture, backend=backend, **settings, **own)
+    settings |= {"num_collectors": players, "sync": True}
+    if backend == "process":  # passing open files to spawned processes fails for shared storages
+        torch.multiprocessing.set_sharing_strategy("file_system")
+        return Collector(make_env, mixture, backend=backend, **settings, **own)
+    if importlib.util.find_spec("ray") is None:
+        raise ValueError('backend "ray" needs Ray: pip install ray, or choose "process"')
+    options = {"collector_kwargs": own, "remote_configs": {"num_cpus": 1, "num_gpus": 0}}
+    return Collector(make_env, mixture, backend=backend, backend_options=options, **settings)
+
+
 class Aggregator:
     """Collects demonstrations round by round through a TorchRL collector."""
 
@@ -264,21 +285,14 @@ class Aggregator:
             max_cycles=config.rollout_length,
             dtype="uint8",
         )
-        elsewhere: dict[str, Any] = {"num_collectors": players, "sync": True}
-        if config.backend == "process":  # passing open files to spawned processes fails for shared storages
-            torch.multiprocessing.set_sharing_strategy("file_system")
-        if config.backend == "ray":
-            elsewhere["backend_options"] = {"remote_configs": {"num_cpus": 1, "num_gpus": 0}}
-        self._collector = Collector(
-            make_env() if config.backend == "direct" else make_env,
+        self._collector = _collector(
+            config.backend,
+            players,
+            make_env,
             self._mixture,
-            backend=config.backend,
-            **({} if config.backend == "direct" else elsewhere),
             frames_per_batch=teams * config.rollout_length,
             reset_at_each_iter=True,
-            compact_obs=True,
             trust_policy=True,
-            auto_register_policy_transforms=False,
         )
         self._batches: Iterator[TensorDictBase] = iter(self._collector)
 

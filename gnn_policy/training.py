@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from filelock import FileLock, Timeout
 from torch.utils.tensorboard import SummaryWriter
 
 from gnn_policy import checkpoint, evaluation
@@ -61,6 +62,23 @@ def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None
         density=config.density,
         styles=config.styles,
     )
+
+
+def lock_run(folder: Path) -> FileLock:
+    """Keep other processes out of a run folder, until the lock is released or this process ends.
+
+    Raises:
+        FileExistsError: If another process has it.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder.parent / f".{folder.name}.lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise FileExistsError(
+            f"another process is training in {folder}: wait for its end, or choose another folder with --run"
+        ) from None
+    return lock
 
 
 def open_run(folder: Path, config: TrainConfig) -> None:
@@ -147,6 +165,7 @@ class Training:
         self._shards: list[Demonstrations] = []
         found: dict[str, Any] | None = None
         if ranks.rank == 0:
+            self._lock = lock_run(folder)
             open_run(folder, config)
             (folder / "demonstrations").mkdir(exist_ok=True)
             found = self._read_state()
@@ -180,9 +199,10 @@ class Training:
                     self._save()
                 self.progress.finished(row)
         finally:
+            aggregator.close()
             if writer is not None:
                 writer.close()
-            aggregator.close()
+                self._lock.release()
 
     def _round(self, number: int, aggregator: Aggregator, batches: BatchMaker, exam: evaluation.Exam | None) -> Round:
         config = self.config

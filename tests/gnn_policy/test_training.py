@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import random
 import signal
+import subprocess
 import sys
 import time
 from dataclasses import asdict, replace
@@ -319,6 +320,20 @@ def test_a_finished_run_is_refused(tmp_path):
     (tmp_path / "results.json").write_text("{}")
     with pytest.raises(FileExistsError, match=rf"{tmp_path} holds a finished run.*--run"):
         open_run(tmp_path, CONFIG)
+
+
+def test_a_folder_that_another_process_trains_in_is_refused_until_that_one_ends(tmp_path):
+    program = "import sys, pathlib; from gnn_policy.training import lock_run; "
+    program += "lock = lock_run(pathlib.Path(sys.argv[1])); print('locked', flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", program, str(tmp_path / "run")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "locked\n"
+        with pytest.raises(FileExistsError, match=r"another process is training in .*run.*--run"):
+            Training(CONFIG, tmp_path / "run", Silence())
+        assert not (tmp_path / "run").exists()
+        other.kill()
+    assert not Training(CONFIG, tmp_path / "run", Silence()).history
 
 
 def test_settings_that_do_not_fit_leave_no_folder_behind(tmp_path):
