@@ -64,7 +64,8 @@ class BatchedEnv:
             `Step.final_observation` has the last ones of those that ended.
         cases: Instances to play, drawn anew at each reset by the seed, in place of random ones.
         fill: Take instances that are smaller than the environment too: the map is filled up with obstacles, and the
-            robots that are not there have zeros everywhere; `present` says which are.
+            robots that are not there have zeros everywhere, but for the action mask, which leaves them idle, so that a
+            masked choice is always defined; `present` says which are there.
         settings: Fields of `EnvConfig`.
 
     Raises:
@@ -154,7 +155,11 @@ class BatchedEnv:
 
     @property
     def present(self) -> npt.NDArray[np.bool_]:
-        """(B, N) which robots are there."""
+        """(B, N) which robots are there.
+
+        Like all properties that is the state now. With autoreset SAME_STEP a step that ends leaves the next episode
+        here: what was read before the step says whom its rewards and its `final_observation` are of.
+        """
         return np.arange(self.num_agents) < self._state.team_sizes[:, None]
 
     @property
@@ -304,7 +309,7 @@ class BatchedEnv:
         return self._state.on_goal.copy()
 
     def action_mask(self) -> npt.NDArray[np.int8]:
-        """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle."""
+        """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle; of absent robots for idle."""
         self.stepper.write_action_masks()
         return self._state.action_mask.copy()
 
