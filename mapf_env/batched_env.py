@@ -309,7 +309,7 @@ class BatchedEnv:
         return self._state.on_goal.copy()
 
     def action_mask(self) -> npt.NDArray[np.int8]:
-        """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle; of absent robots for idle."""
+        """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle; absent robots may idle."""
         self.stepper.write_action_masks()
         return self._state.action_mask.copy()
 
