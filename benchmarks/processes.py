@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import os
 import subprocess
@@ -36,6 +37,7 @@ def fitted(run: Path, processes: int, threads: int) -> float:
 
 def main() -> None:
     """Print a line for each way."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         for processes, threads in ((1, 1), (1, 2), (2, 1)):
             rate = fitted(Path(folder, f"{processes}-{threads}"), processes, threads)
