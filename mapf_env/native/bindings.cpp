@@ -9,6 +9,7 @@
 #include <tuple>
 
 #include "mapf_env/native/arrays.hpp"
+#include "mapf_env/native/checks.hpp"
 #include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/generate.hpp"
 #include "mapf_env/native/goals.hpp"
@@ -25,17 +26,14 @@ using namespace nb::literals;
 
 namespace {
 
+using mapf::fail;
 using mapf::In;
 using mapf::InOut;
 using mapf::Layout;
 using mapf::make_array;
 using mapf::Out;
-
-[[noreturn]] void fail(const std::string& message) { throw nb::value_error(message.c_str()); }
-
-void require(bool holds, const char* message) {
-    if (!holds) fail(message);
-}
+using mapf::require;
+using mapf::shown;
 
 mapf::Grid to_grid(const In<bool, 2>& grid) {
     return {reinterpret_cast<const std::uint8_t*>(grid.data()), static_cast<int>(grid.shape(0)),
@@ -168,14 +166,10 @@ Out<std::int8_t> shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positio
     const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1);
     require_on_map(positions, layout, num_envs, "positions");
     if (actions.shape(0) != num_envs || actions.shape(1) != num_agents)
-        fail("actions must have shape (" + std::to_string(num_envs) + ", " + std::to_string(num_agents) + "), got (" +
-             std::to_string(actions.shape(0)) + ", " + std::to_string(actions.shape(1)) + ")");
+        fail("actions must have shape " + shown({num_envs, num_agents}) + ", got " +
+             shown({actions.shape(0), actions.shape(1)}));
     require(seeds.shape(0) == num_envs && times.shape(0) == num_envs, "give one seed and time for each environment");
-    for (std::size_t i = 0; i < num_envs * num_agents; ++i)
-        if (actions.data()[i] < 0 || actions.data()[i] >= mapf::num_actions)
-            fail("action " + std::to_string(actions.data()[i]) + " of agent " + std::to_string(i % num_agents) +
-                 " in environment " + std::to_string(i / num_agents) +
-                 " is none of 0..4 (up, left, down, right, idle)");
+    mapf::require_actions(actions.data(), num_envs, num_agents);
     auto [executed, out] = make_array<std::int8_t>({num_envs, num_agents});
     nb::gil_scoped_release release;
     mapf::ShieldScratch scratch(layout, static_cast<int>(num_agents));
@@ -309,9 +303,7 @@ Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> po
     require(!by_values || values.shape(2) == mapf::num_actions, "values of actions must have shape (B, N, 5)");
     for (std::size_t i = 0; i < values.size(); ++i)
         require(!std::isnan(values.data()[i]), "the values of actions must be numbers");
-    for (std::size_t i = 0; !by_values && i < actions.size(); ++i)
-        require(actions.data()[i] >= 0 && actions.data()[i] < mapf::num_actions,
-                "actions must be 0..4 (up, left, down, right, idle)");
+    if (!by_values) mapf::require_actions(actions.data(), num_envs, num_agents);
     require(under_way.shape(0) == num_envs && under_way.shape(1) == num_agents, "under_way must have shape (B, N)");
     require(seeds.shape(0) == num_envs && times.shape(0) == num_envs, "give one seed and time for each environment");
     auto [executed, out] = make_array<std::int8_t>({num_envs, num_agents});
