@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from mapf_env.arguments import cells, each_of, instance_of, integer, number, seed
+from mapf_env.arguments import MOST_THREADS, cells, each_of, instance_of, integer, number, seed
 
-__all__ = ["at_least_one", "cells", "each_of", "instance_of", "seconds", "seed", "suboptimality"]
+__all__ = ["MOST_THREADS", "at_least_one", "cells", "each_of", "instance_of", "seconds", "seed", "suboptimality"]
 
 DEFAULT_W = 1.05
 DEFAULT_TIME_LIMIT = 10.0
@@ -17,7 +17,6 @@ DEFAULT_MAX_STEPS = 1_000
 DEFAULT_MAX_ORDERS = 100
 MAX_STEPS = 2**31 - 2
 MAX_ORDERS = 2**31 - 1
-MAX_THREADS = 1024
 
 
 def suboptimality(w: float) -> float:

@@ -53,6 +53,6 @@ def solve_batch(
         arguments.seconds(time_limit),
         arguments.at_least_one(node_limit, "node_limit"),
         arguments.seed(seed),
-        arguments.at_least_one(threads, "threads", maximum=arguments.MAX_THREADS),
+        arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS),
     )
     return [as_result(part) for part in parts]

@@ -119,7 +119,7 @@ def solve_stream(
         "seed": arguments.seed(seed),
     }
     arguments.suboptimality(w)
-    threads = arguments.at_least_one(threads, "threads", maximum=arguments.MAX_THREADS)
+    threads = arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS)
     backlog = arguments.at_least_one(backlog, "backlog")
     problems = arguments.each_of(instances, Instance, "instances")
     if progress is not None and not callable(progress):

@@ -69,7 +69,7 @@ def relabel(
         arguments.suboptimality(w),
         arguments.at_least_one(node_limit, "node_limit"),
         arguments.seed(seed),
-        arguments.at_least_one(threads, "threads", maximum=arguments.MAX_THREADS),
+        arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS),
     )
 
 

@@ -15,6 +15,7 @@ T = TypeVar("T")
 _INT32 = np.iinfo(np.int32)
 MOST_INT = int(_INT32.max)
 """The native core counts robots, steps and a map's cells, its border included, in 32 bits."""
+MOST_THREADS = 1024
 
 
 def instance_of(value: object, kind: type[T], name: str) -> T:

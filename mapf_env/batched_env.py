@@ -84,7 +84,7 @@ class BatchedEnv:
         **settings: Any,
     ) -> None:
         self.num_envs = num_envs = arguments.integer(num_envs, "num_envs", 1, arguments.MOST_INT)
-        self.threads = arguments.integer(threads, "threads", 1, arguments.MOST_INT)
+        self.threads = arguments.integer(threads, "threads", 1, arguments.MOST_THREADS)
         try:
             self.autoreset = AutoresetMode(autoreset)
         except ValueError:

@@ -107,7 +107,7 @@ CALLS: dict[str, Any] = {
         SETTINGS
         | {
             "num_envs": COUNT_32_BITS,
-            "threads": COUNT_32_BITS,
+            "threads": (*COUNT, 1025),
             "autoreset": WORD,
             "cases": (*but(SEVERAL, NoneType), [], INSTANCE),
             "fill": FLAG,
