@@ -34,20 +34,20 @@ class Instance:
     grid: Obstacles
     starts: Cells
     goals: Cells
-    _components: npt.NDArray[np.int32] = field(init=False)
+    _regions: npt.NDArray[np.int32] = field(init=False)
 
     def __init__(self, grid: npt.ArrayLike, starts: npt.ArrayLike, goals: npt.ArrayLike) -> None:
         obstacles = as_obstacles(grid)
-        self._set(obstacles, _native.components(obstacles), _team(starts, "starts"), _team(goals, "goals"))
+        self._set(obstacles, _native.regions(obstacles), _team(starts, "starts"), _team(goals, "goals"))
 
-    def _set(self, grid: Obstacles, components: npt.NDArray[np.int32], starts: Cells, goals: Cells) -> None:
+    def _set(self, grid: Obstacles, regions: npt.NDArray[np.int32], starts: Cells, goals: Cells) -> None:
         if starts.shape != goals.shape:
             raise ValueError(f"{len(starts)} starts but {len(goals)} goals: give one goal for each robot")
         _require_free(grid, starts, "start")
         _require_free(grid, goals, "goal")
         _require_distinct(starts, "start")
         _require_distinct(goals, "goal")
-        cut_off = np.flatnonzero(components[tuple(starts.T)] != components[tuple(goals.T)])
+        cut_off = np.flatnonzero(regions[tuple(starts.T)] != regions[tuple(goals.T)])
         if len(cut_off):
             robot = cut_off[0]
             raise ValueError(
@@ -58,7 +58,7 @@ class Instance:
             ("grid", grid),
             ("starts", starts),
             ("goals", goals),
-            ("_components", components),
+            ("_regions", regions),
         ):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -75,7 +75,7 @@ class Instance:
             ValueError: If the positions are not distinct free cells from which the goals can be reached.
         """
         seen_from_here = object.__new__(Instance)
-        seen_from_here._set(self.grid, self._components, _team(positions, "positions"), self.goals)
+        seen_from_here._set(self.grid, self._regions, _team(positions, "positions"), self.goals)
         return seen_from_here
 
     def __eq__(self, other: object) -> bool:

@@ -65,9 +65,12 @@ void require_on_map(const Cells& cells, const Layout& layout, std::size_t num_en
                  std::to_string(cell[1]) + "), lies outside the map");
 }
 
-Out<std::int32_t> components(In<bool, 2> grid) {
-    auto [labels, out] = make_array<std::int32_t>({grid.shape(0), grid.shape(1)});
-    mapf::label_components(to_grid(grid), labels);
+Out<std::int32_t> regions(In<bool, 2> grid) {
+    const auto map = to_grid(grid);
+    const auto found = mapf::regions_of(map);
+    auto [region, out] = make_array<std::int32_t>({grid.shape(0), grid.shape(1)});
+    for (int row = 0; row < map.layout.height; ++row, region += map.layout.width)
+        std::copy_n(found.data() + map.layout.cell(row, 0), map.layout.width, region);
     return out;
 }
 
@@ -340,15 +343,12 @@ void draw_goals(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, InOu
     require(seeds.shape(0) == num_envs, "give one seed for each environment");
     std::vector<std::uint8_t> taken(size, 0);
     for (std::size_t b = 0; b < num_envs; ++b) {
-        std::vector<std::int32_t> inner(static_cast<std::size_t>(layout.height) * layout.width), label(size, -1);
-        mapf::label_components(mapf::grid_of(layout, obstacles.data() + b * size), inner.data());
-        for (int row = 0; row < layout.height; ++row)
-            std::copy_n(inner.data() + row * layout.width, layout.width, label.data() + layout.cell(row, 0));
+        const auto regions = mapf::regions_of(mapf::grid_of(layout, obstacles.data() + b * size));
         auto* team = goals.data() + b * num_agents * 2;
         mapf::mark(layout, team, static_cast<int>(num_agents), std::uint8_t{1}, taken.data());
         for (std::size_t i = 0; i < num_agents; ++i)
             if (arrived(b, i))
-                mapf::draw_goal(layout, label.data(), positions.data() + (b * num_agents + i) * 2,
+                mapf::draw_goal(layout, regions.data(), positions.data() + (b * num_agents + i) * 2,
                                 mapf::goal_random(seeds(b), static_cast<int>(i), arrivals(b, i)), taken.data(),
                                 team + 2 * i);
         mapf::mark(layout, team, static_cast<int>(num_agents), std::uint8_t{0}, taken.data());
@@ -379,8 +379,7 @@ void define_for_dtype(nb::module_& m) {
 
 NB_MODULE(_native, m) {
     m.doc() = "Native kernels of the world: distances, maps, shield, views and communication graphs, over batches.";
-    m.def("components", &components, "grid"_a,
-          "(H, W) int32 label of the connected free region of each cell; -1 on obstacles.");
+    m.def("regions", &regions, "grid"_a, "(H, W) int32 number of the region of each cell; -1 on obstacles.");
     m.def("distances", &distances, "grid"_a, "cells"_a,
           "(M, H, W) int32 steps from each cell to each of M free cells (M, 2); -1 where there is no way.");
     const mapf::Parts parts;
