@@ -18,7 +18,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -35,7 +35,8 @@ from rich.progress import Progress
 from gnn_policy import checkpoint, evaluation
 from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.execution import Execution
-from gnn_policy.network import DecentralizedPolicy, PolicyConfig
+from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.precision import autocast
 from gnn_policy.rollout import rollout
 from gnn_policy.training import split_cases
 from mapf_env.files import replacing, write_whole
@@ -74,12 +75,14 @@ class Options:
     "connected", K > 1, and one "informed" by a channel of the cost to go and trained under the PIBT shield, K = 3."""
     styles: tuple[MapStyle, ...] = ("cells", "walls")
     """Styles of the test maps, a table each."""
-    rows: tuple[str, ...] = ("argmax", "stuck", "sampled")
-    """How the policies are executed, as in gnn_policy.evaluate."""
+    rows: tuple[str, ...] = ("argmax", "stuck")
+    """How the policies are executed, as in gnn_policy.evaluate; the informed one under both shields."""
+    own_size_rows: tuple[str, ...] = ("sampled",)
+    """Further ways, for figure 2 alone: on teams of the size that a model was trained on."""
     cases_per_map: int = 50
     """Test cases on each of 90 maps."""
     large: bool = True
-    """Test models of 10 and more robots on the paper's maps of 50x50 as well, where teams have 20, 40 and 60."""
+    """Test the model of the largest training team on maps of 50x50 as well, where teams have 20, 40 and 60."""
     threads: int = 1
     """CPU threads of training, testing and the expert."""
 
@@ -113,7 +116,6 @@ class Model:
             ),
             num_agents=N,
             shield="pibt" if informed else "idle",
-            test_maps=1,  # the test is this program's
             **{name: getattr(full, name) * max(PAPER) // N for name in counts},
         )
 
@@ -133,7 +135,10 @@ class Scene:
 
 
 LARGE = tuple((50, N) for N in (20, 40, 60))
-"""Side of the map and size of the team of the paper's large maps; models trained on 10 and more robots meet them."""
+"""Side of the map and size of the team of the longer paper's large maps."""
+LARGEST = max(PAPER)
+STEPS = {20: 36, 50: 90}
+"""How long a team is under way on a map of this side, about; to say how long the tests take."""
 
 
 class Experiment:
@@ -141,7 +146,7 @@ class Experiment:
 
     def __init__(self, options: Options, console: Console) -> None:
         self.options, self.console = options, console
-        self.variants = {variant.name: variant for variant in map(Execution.parse, options.rows)}
+        self.variants = {each.name: each for each in map(Execution.parse, options.rows + options.own_size_rows)}
         self.models = [Model(N, K, kind) for kind in options.kinds for K in options.taps for N in options.train_on]
         self.models = [model for model in self.models if self._wanted(model)]
         self.scenes = [Scene(style, N) for style in options.styles for N in TEAMS]
@@ -156,8 +161,10 @@ class Experiment:
         self.console.print(f"{len(self.models) - len(untrained)} of {len(self.models)} models are trained", end="; ")
         self.console.print(f"the others take about {hours:.1f} hours with {self.options.threads} thread(s)")
         pairs = list(self._pairs())
-        untested = sum(not self._result(scene, model.name).exists() for scene, model in pairs)
-        self.console.print(f"{len(pairs) - untested} of {len(pairs)} pairs of model and test cases are tested")
+        untested = [pair for pair in pairs if not self._result(pair[0], pair[1].name).exists()]
+        hours = sum(self._test_seconds(*pair) for pair in untested) / 3600
+        self.console.print(f"{len(pairs) - len(untested)} of {len(pairs)} tests are done", end="; ")
+        self.console.print(f"the others take about {hours:.1f} hours")
 
     def train(self) -> None:
         """Train what is not trained; each model resumes by itself."""
@@ -167,6 +174,7 @@ class Experiment:
             self.console.rule(f"training on {model.num_agents} robots, K = {model.taps}")
             command = [sys.executable, "-m", "gnn_policy.train", "--run", str(self.run_of(model))]
             command += ["--recipe", "full", "--threads", str(self.options.threads), *_arguments(model.config)]
+            command += ["--test-maps", "1"]  # the test is this program's
             subprocess.run(command, check=True)
 
     def test(self) -> None:
@@ -186,7 +194,7 @@ class Experiment:
                 exam = self._exam(scene)
                 for player in players:
                     progress.update(task, description=f"{scene.name}: {player.name if player else 'baselines'}")
-                    rows = evaluation.baselines(exam) if player is None else self._scores(player, exam)
+                    rows = evaluation.baselines(exam) if player is None else self._scores(scene, player, exam)
                     result = {"cases_per_map": self.options.cases_per_map, **evaluation.as_json(rows, exam)}
                     path = self._result(scene, player.name if player else "baselines")
                     path.parent.mkdir(parents=True, exist_ok=True)
@@ -217,20 +225,22 @@ class Experiment:
 
     @staticmethod
     def _wanted(model: Model) -> bool:
-        return (
-            model.kind == "paper"
-            or (model.num_agents == max(PAPER) and model.taps == 3)
-            or (model.num_agents == max(PAPER) and model.taps > 1 and model.kind == "connected")
-        )
+        least = {"paper": 1, "connected": 2, "informed": 3}[model.kind]
+        return model.taps >= least and (model.kind == "paper" or model.num_agents == LARGEST)
 
     def _pairs(self) -> Iterator[tuple[Scene, Model]]:
         """Which model is tested where."""
         for scene in self.scenes:
             for model in self.models:
-                own_size = scene.size == 20 and scene.num_agents == model.num_agents
-                general = model.taps == 3 and (scene.size == 20 or model.num_agents >= 10)
-                if own_size or general:
+                general = model.taps == 3 and model.kind != "connected" and scene.size == 20
+                large = model == Model(LARGEST, 3) and scene.size == 50
+                if general or large or _own_size(scene, model):
                     yield scene, model
+
+    def _executions(self, scene: Scene, model: Model) -> list[Execution]:
+        names = self.options.rows + (self.options.own_size_rows if _own_size(scene, model) else ())
+        both = names + tuple(f"{name},pibt" for name in self.options.rows) if model.kind == "informed" else names
+        return [Execution.parse(name) for name in both]
 
     def _result(self, scene: Scene, player: str) -> Path:
         return self.options.folder / "results" / scene.name / f"{player}.json"
@@ -246,29 +256,39 @@ class Experiment:
         cases = split_cases(config, "test", scene.num_agents)
         return evaluation.Exam.prepare(cases, w=W, timeout=config.timeout, threads=self.options.threads)
 
-    def _scores(self, model: Model, exam: evaluation.Exam) -> list[evaluation.Score]:
+    def _scores(self, scene: Scene, model: Model, exam: evaluation.Exam) -> list[evaluation.Score]:
         policy = checkpoint.load(self.run_of(model))
         return [
-            evaluation.score(name, exam, rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(variant)))
-            for name, variant in self.variants.items()
+            evaluation.score(each.name, exam, rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(each)))
+            for each in self._executions(scene, model)
         ]
 
     def _training_seconds(self, model: Model) -> float:
-        """What the gradient steps of a training take here, and a quarter more for all else."""
-        config = RECIPES["full"]
-        updates = config.epochs * (config.updates_per_epoch or 0)
-        policy = DecentralizedPolicy(PolicyConfig(encoder="lean", taps=model.taps))
+        """What the gradient steps of a training take here, and two fifths more for all else."""
+        config = model.config
+        policy = DecentralizedPolicy(config.policy)
         optimizer = torch.optim.Adam(policy.parameters(), fused=True)
-        fov = torch.zeros(config.batch_size, model.num_agents, 3, 11, 11)
+        fov = torch.zeros(config.batch_size, model.num_agents, config.policy.channels, 11, 11)
         graph = torch.zeros(config.batch_size, model.num_agents, model.num_agents)
-        steps = 20
-        for warm in (True, False):
-            began = time.perf_counter()
-            for _ in range(2 if warm else steps):
-                optimizer.zero_grad()
-                policy(fov, graph).square().mean().backward()
-                optimizer.step()
-        return 1.25 * updates * (time.perf_counter() - began) / steps
+
+        def step() -> None:
+            optimizer.zero_grad()
+            with autocast(config.precision, fov.device):
+                logits = policy(fov, graph)
+            logits.float().square().mean().backward()
+            optimizer.step()
+
+        return 1.4 * config.epochs * (config.updates_per_epoch or 0) * _seconds(step)
+
+    def _test_seconds(self, scene: Scene, model: Model) -> float:
+        """What the network's forward passes take here, and a quarter more for all else."""
+        policy = DecentralizedPolicy(model.config.policy).eval()
+        fov = torch.zeros(64, scene.num_agents, model.config.policy.channels, 11, 11)
+        graph = torch.zeros(64, scene.num_agents, scene.num_agents)
+        with torch.inference_mode():
+            each = _seconds(lambda: policy(fov, graph), times=2) / 64
+        cases = model.config.test_maps * self.options.cases_per_map
+        return 1.25 * each * cases * STEPS[scene.size] * len(self._executions(scene, model))
 
     def _row(self, scene: Scene, player: str, row: str) -> dict[str, Any] | None:
         path = self._result(scene, player)
@@ -356,7 +376,11 @@ class Experiment:
     def _table(self, scenes: Sequence[Scene], measure: str) -> Iterator[str]:
         yield "| player | " + " | ".join(str(scene.num_agents) for scene in scenes) + " |"
         yield "|---|" + "---|" * len(scenes)
-        players = [(model.name, row) for model in self.models for row in self.variants]
+        players = [
+            (model.name, execution.name)
+            for model in self.models
+            for execution in self._executions(Scene("cells", model.num_agents), model)
+        ]
         baselines = [("baselines", row) for row in self._names_of_baselines(scenes)]
         for player, row in [*players, *baselines]:
             found = [self._row(scene, player, row) for scene in scenes]
@@ -385,6 +409,19 @@ def _arguments(config: TrainConfig) -> list[str]:
                 option = f"--{prefix}{name}".replace("_", "-")
                 words += [option] if value is True else [option, str(value)]
     return words
+
+
+def _own_size(scene: Scene, model: Model) -> bool:
+    return scene.size == 20 and scene.num_agents == model.num_agents
+
+
+def _seconds(action: Callable[[], object], times: int = 20) -> float:
+    """Of one call, after a warm-up."""
+    action()
+    began = time.perf_counter()
+    for _ in range(times):
+        action()
+    return (time.perf_counter() - began) / times
 
 
 def _cell(estimate: dict[str, float | None]) -> str:

@@ -18,6 +18,7 @@ from mapf_env.generation import MapStyle
 Recipe = Literal["quick", "full", "paper"]
 RobotOrder = Literal["index", "random", "farthest", "nearest"]
 Aggregation = Literal["visited", "stuck"]
+Backend = Literal["direct", "process", "ray"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +87,11 @@ class TrainConfig:
     """Steps that a team plays in a round."""
     rollout_teams: int = 128
     """Teams that play side by side."""
+    backend: Backend = "direct"
+    """Where TorchRL's collector plays: in this process, or in as many others as there are `collectors`, which this
+    machine ("process") or a Ray cluster ("ray") runs."""
+    collectors: int = 1
+    """How many of them share a process's rollout_teams; each has a seed of its own."""
     shield: Shield = "idle"
     """Under which aggregated rollouts and validation play: the paper's "idle", or "pibt", which takes the logits as
     preferences."""
@@ -121,7 +127,7 @@ class TrainConfig:
         positive = (
             "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
             "expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
-            "rollout_teams lr final_lr validate_every"
+            "rollout_teams collectors lr final_lr validate_every"
         )
         for name in positive.split():
             if not 0 < getattr(self, name) < math.inf:
@@ -135,6 +141,7 @@ class TrainConfig:
         for name, choices in (
             ("robot_order", get_args(RobotOrder)),
             ("aggregation", get_args(Aggregation)),
+            ("backend", get_args(Backend)),
             ("shield", get_args(Shield)),
             ("precision", get_args(Precision)),
         ):
@@ -143,6 +150,8 @@ class TrainConfig:
         for name in ("seed", "data_seed"):
             if getattr(self, name) >= 2**64:
                 raise ValueError(f"{name} must be below 2**64, got {getattr(self, name)}")
+        if self.backend == "direct" and self.collectors > 1:
+            raise ValueError(f'{self.collectors} collectors need processes: backend "process" or "ray"')
         if not 1 <= self.w < math.inf:
             raise ValueError(f"w must be at least 1 and finite, got {self.w}")
         if self.updates_per_epoch is not None and self.updates_per_epoch < 1:

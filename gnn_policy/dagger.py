@@ -7,6 +7,7 @@ that of the paper's released code.
 
 from __future__ import annotations
 
+import functools
 import math
 import pkgutil
 import time
@@ -200,14 +201,25 @@ class Mixture(TensorDictModuleBase):
         self.policy, self.teacher, self.config = policy, teacher, config
         self.in_keys = [FOV, GRAPH, POSITIONS, CASE]  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = [ACTION]  # pyright: ignore[reportAttributeAccessIssue]
-        self.beta = 1.0
-        self.random = torch.Generator()
+        # Buffers, so that they reach a collector's processes together with the weights.
+        self.register_buffer("beta", torch.ones(()))
+        self.register_buffer("seed", torch.zeros((), dtype=torch.int64))
+        self._random, self._seeded = torch.Generator(), -1
 
-    @torch.inference_mode()
+    def begin(self, beta: float, seed: int) -> None:
+        """Set the share of the expert, and the seed of all draws from now on."""
+        self.beta.fill_(beta)
+        self.seed.fill_(seed)
+        self.policy.eval()
+
+    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the joint actions (B, N)."""
-        teams = tensordict.batch_size[0]
-        by_expert = torch.rand(teams, generator=self.random) < self.beta
+        teams, cases = tensordict.batch_size[0], tensordict[CASE]
+        if self._seeded != int(self.seed):
+            self._seeded = int(self.seed)
+            self._random.manual_seed(self._seeded + int(cases.sum()))  # collectors side by side play other cases
+        by_expert = torch.rand(teams, generator=self._random) < self.beta.cpu()
         positions = tensordict[POSITIONS]
         values = torch.empty(*positions.shape[:2], len(Action))
         if not by_expert.all():
@@ -215,9 +227,9 @@ class Mixture(TensorDictModuleBase):
             with autocast(self.config.precision, device):
                 values = self.policy(tensordict[FOV].to(device), tensordict[GRAPH].to(device)).float().cpu()
             if self.config.sample_rollouts:  # the greatest of the logits with Gumbel noise is a draw from the softmax
-                values -= torch.empty_like(values).exponential_(generator=self.random).log()
+                values -= torch.empty_like(values).exponential_(generator=self._random).log()
         if by_expert.any():
-            moves, _ = self.teacher.moves(np.asarray(tensordict[CASE][by_expert]), np.asarray(positions[by_expert]))
+            moves, _ = self.teacher.moves(np.asarray(cases[by_expert]), np.asarray(positions[by_expert]))
             values[by_expert] = one_hot(torch.from_numpy(moves.astype(np.int64)), len(Action)).float()
         return tensordict.set(ACTION, values if self.config.shield == "pibt" else values.argmax(-1))
 
@@ -234,10 +246,14 @@ class Aggregator:
         ranks: Ranks = Ranks(),
     ) -> None:
         self._config, self._teacher, self._rank = config, teacher, ranks.rank
-        self._teams = ranks.share("rollout_teams", config.rollout_teams)
+        teams, players = ranks.share("rollout_teams", config.rollout_teams), config.collectors
+        if teams % players:
+            raise ValueError(f"rollout_teams of a process must be a multiple of its {players} collectors, got {teams}")
         self._mixture = Mixture(policy, teacher, config)
-        self._env = TeamEnv(
-            self._teams,
+        self._mixture.begin(beta=1.0, seed=0)
+        make_env = functools.partial(
+            TeamEnv,
+            teams // players,
             instances,
             fov_radius=config.policy.fov_radius,
             extra_channels=("cost_to_go",) if config.policy.cost_to_go else (),
@@ -248,10 +264,17 @@ class Aggregator:
             max_cycles=config.rollout_length,
             dtype="uint8",
         )
+        elsewhere: dict[str, Any] = {"num_collectors": players, "sync": True}
+        if config.backend == "process":  # passing open files to spawned processes fails for shared storages
+            torch.multiprocessing.set_sharing_strategy("file_system")
+        if config.backend == "ray":
+            elsewhere["backend_options"] = {"remote_configs": {"num_cpus": 1, "num_gpus": 0}}
         self._collector = Collector(
-            self._env,
+            make_env() if config.backend == "direct" else make_env,
             self._mixture,
-            frames_per_batch=self._teams * config.rollout_length,
+            backend=config.backend,
+            **({} if config.backend == "direct" else elsewhere),
+            frames_per_batch=teams * config.rollout_length,
             reset_at_each_iter=True,
             compact_obs=True,
             trust_policy=True,
@@ -269,10 +292,10 @@ class Aggregator:
             states that the expert could not solve.
         """
         seed = int(np.random.SeedSequence([self._config.seed, round_number, self._rank]).generate_state(1)[0])
-        self._env.set_seed(seed)
-        self._mixture.random.manual_seed(seed)
-        self._mixture.beta = self._config.beta_decay**round_number
-        self._mixture.policy.eval()
+        self._mixture.begin(self._config.beta_decay**round_number, seed)
+        if self._config.backend != "direct":
+            self._collector.update_policy_weights_()
+        self._collector.set_seed(seed)
         stuck_only = self._config.aggregation == "stuck" and round_number > 0
         cases, positions = [], []
         for _ in range(-(-steps // (self._config.rollout_teams * self._config.rollout_length))):

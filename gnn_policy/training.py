@@ -241,7 +241,7 @@ class Training:
         for update, chosen in enumerate(draws):
             own = chosen[self.ranks.rank :: self.ranks.count]
             batch = batches.batch(demonstrations, own, rng).to(config.device)
-            with autocast(config.precision, batch.device):
+            with autocast(config.precision, self.policy.head.weight.device):
                 outcome = self.loss(batch)
             self.optimizer.zero_grad()
             outcome["loss_imitation"].backward()

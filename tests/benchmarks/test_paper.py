@@ -7,12 +7,22 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from gnn_policy.config import RECIPES
+from gnn_policy.train import parse
+
 PAPER = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "paper.py"))
 Experiment, Model, Options, Scene = (PAPER[name] for name in ("Experiment", "Model", "Options", "Scene"))
 
 
 def experiment(folder: Path, **changes: object):
-    options = {"folder": folder, "train_on": (4, 10), "styles": ("cells",), "cases_per_map": 1, "large": False}
+    options = {
+        "folder": folder,
+        "train_on": (4, 12),
+        "kinds": ("paper",),
+        "styles": ("cells",),
+        "cases_per_map": 1,
+        "large": False,
+    }
     return Experiment(Options(**{**options, **changes}), Console(quiet=True))
 
 
@@ -30,11 +40,41 @@ def finish(whole, model, success: float = 0.5) -> None:
 
 def test_figure_two_tests_every_k_on_its_own_size_and_figure_three_k_3_on_all(tmp_path):
     pairs = {(scene.name, model.name) for scene, model in experiment(tmp_path)._pairs()}
-    own = {(f"20x20-cells-n{N}", f"n{N}-k{K}") for N in (4, 10) for K in (1, 2, 3)}
-    general = {(f"20x20-cells-n{N}", f"n{M}-k3") for N in (4, 6, 8, 10, 12, 14) for M in (4, 10)}
+    own = {(f"20x20-cells-n{N}", f"n{N}-k{K}") for N in (4, 12) for K in (1, 2, 3)}
+    general = {(f"20x20-cells-n{N}", f"n{M}-k3") for N in (4, 6, 8, 10, 12, 14) for M in (4, 12)}
     assert pairs == own | general
     large = {(scene.name, model.name) for scene, model in experiment(tmp_path, large=True)._pairs()} - pairs
-    assert large == {(f"50x50-cells-n{N}", "n10-k3") for N in (20, 40, 60)}
+    assert large == {(f"50x50-cells-n{N}", "n12-k3") for N in (20, 40, 60)}
+    kinds = ("connected", "informed")
+    beyond = {(scene.name, model.name) for scene, model in experiment(tmp_path, kinds=kinds)._pairs()}
+    connected = {("20x20-cells-n12", f"n12-k{K}-connected") for K in (2, 3)}
+    assert beyond == connected | {(f"20x20-cells-n{N}", "n12-k3-informed") for N in (4, 6, 8, 10, 12, 14)}
+
+
+def test_models_are_drawn_from_on_teams_of_their_own_size_and_the_informed_one_plays_under_both_shields(tmp_path):
+    whole = experiment(tmp_path)
+
+    def names(N, model):
+        return [each.name for each in whole._executions(Scene("cells", N), model)]
+
+    assert names(4, Model(4, 3)) == ["argmax", "stuck,1", "sampled,1"]
+    assert names(6, Model(4, 3)) == ["argmax", "stuck,1"]
+    assert names(14, Model(12, 3, "informed")) == ["argmax", "stuck,1", "argmax,pibt", "stuck,1,pibt"]
+
+
+@pytest.mark.parametrize(
+    "model", [Model(4, 3), Model(10, 1), Model(12, 2), Model(12, 3, "connected"), Model(12, 3, "informed")]
+)
+def test_the_command_trains_the_model_that_is_meant(model):
+    assert parse(["--recipe", "full", *PAPER["_arguments"](model.config)]).config == model.config
+
+
+def test_rounds_have_equally_many_robot_states_for_every_size_of_the_team():
+    full = RECIPES["full"]
+    for N in (4, 6, 8, 10, 12):
+        config = Model(N, 3).config
+        for name in ("batch_size", "dagger_steps", "demonstration_steps"):
+            assert getattr(config, name) * N == pytest.approx(getattr(full, name) * 12, rel=0.02)
 
 
 def test_only_what_is_missing_is_trained(tmp_path, monkeypatch):
@@ -43,19 +83,20 @@ def test_only_what_is_missing_is_trained(tmp_path, monkeypatch):
     monkeypatch.setattr("subprocess.run", lambda command, check: trained.append(command))
     whole.train()
     (command,) = trained
-    assert command[1:5] == ["-m", "gnn_policy.train", "--recipe", "full"]
-    assert command[command.index("--num-agents") + 1] == "10"
-    assert command[command.index("--run") + 1] == str(tmp_path / "n10-k3")
+    assert command[1:3] == ["-m", "gnn_policy.train"]
+    assert command[command.index("--recipe") + 1] == "full"
+    assert command[command.index("--num-agents") + 1] == "12"
+    assert command[command.index("--run") + 1] == str(tmp_path / "n12-k3")
 
 
 def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
     whole = experiment(tmp_path)
-    finish(whole, Model(10, 3), success=0.75)
+    finish(whole, Model(12, 3), success=0.75)
     whole.draw()
     text = (tmp_path / "results.md").read_text()
-    assert "| n10-k3 argmax |  |  |  | 0.750 [0.650, 0.850] |  |  |" in text
+    assert "| n12-k3 argmax |  |  |  |  | 0.750 [0.650, 0.850] |  |" in text
     assert "| paper, trained on 10 | 0.965 | 0.952 | 0.925 | 0.898 | 0.854 | 0.814 |" in text
     assert "n4-k3" not in text
-    assert whole._heat("cells", "argmax")[3, 3] == pytest.approx(0.75)
+    assert whole._heat("cells", "argmax")[4, 4] == pytest.approx(0.75)
     for picture in ("figure2-cells.png", "figure3-cells.png"):
         assert (tmp_path / picture).read_bytes()[:4] == b"\x89PNG"

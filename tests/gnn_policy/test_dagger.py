@@ -18,7 +18,7 @@ from gnn_policy.config import TrainConfig
 from gnn_policy.dagger import Aggregator, Mixture, Teacher
 from gnn_policy.demonstrations import BatchMaker
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
-from mapf_env import Instance
+from mapf_env import Action, Instance
 
 STEPS = [(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)]
 CONFIG = TrainConfig(
@@ -98,9 +98,10 @@ def test_round_zero_is_the_expert_itself(cases, policy):
     assert cut_off <= 5 * 3, "more teams broke off than the ends of three batches explain"
 
 
-def test_every_team_reaches_its_goals_under_the_expert(cases, policy):
-    mixture = Mixture(policy, taught_by(cases), CONFIG)
-    env = TeamEnv(len(cases), cases, max_cycles=60, fov_radius=2, dtype="uint8")
+@pytest.mark.parametrize("shield", ["idle", "pibt"])
+def test_every_team_reaches_its_goals_under_the_expert(cases, policy, shield):
+    mixture = Mixture(policy, taught_by(cases), replace(CONFIG, shield=shield))
+    env = TeamEnv(len(cases), cases, max_cycles=60, fov_radius=2, dtype="uint8", shield=shield)
     state, reached = env.reset(seed=0), set()
     for _ in range(60):
         both, state = env.step_and_maybe_reset(mixture(state))
@@ -187,8 +188,7 @@ def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
         policy.head.weight.zero_()
         policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))  # this policy always stays
     mixture = Mixture(policy.eval(), taught_by(cases), CONFIG)
-    mixture.beta = beta
-    mixture.random.manual_seed(0)
+    mixture.begin(beta, seed=0)
     state = states_at_starts(cases, 2000)
     moves = mixture(state)[ACTION].numpy()
     labels, solved = experts.relabel([cases[i] for i in state[CASE].tolist()], state[POSITIONS].numpy())
@@ -202,13 +202,22 @@ def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
 def test_sampled_moves_follow_the_softmax(cases, policy):
     policy.eval()
     mixture = Mixture(policy, taught_by(cases), replace(CONFIG, sample_rollouts=True))
-    mixture.beta = 0.0
+    mixture.begin(beta=0.0, seed=0)
     state = states_at_starts(cases, 1).expand(4000).contiguous()
     moves = mixture(state)[ACTION].numpy()
     with torch.no_grad():
         shares = torch.softmax(policy(state[FOV][:1], state[GRAPH][:1]), -1)[0].numpy()
     counted = np.stack([(moves == action).mean(axis=0) for action in range(5)], -1)
     np.testing.assert_allclose(counted, shares, atol=0.04)
+
+
+def test_under_pibt_the_policys_values_are_its_logits(cases, policy):
+    mixture = Mixture(policy.eval(), taught_by(cases), replace(CONFIG, shield="pibt", precision="float32"))
+    mixture.begin(beta=0.0, seed=0)
+    state = states_at_starts(cases, 8)
+    values = mixture(state)[ACTION]
+    with torch.no_grad():
+        torch.testing.assert_close(values, policy(state[FOV], state[GRAPH]))
 
 
 def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
@@ -395,6 +404,53 @@ def test_round_zero_imitates_whatever_is_aggregated_later(cases, policy):
         collected(replace(CONFIG, aggregation=each), policy, cases, 0, 100)[0] for each in ("visited", "stuck")
     )
     assert np.array_equal(visited.positions, stuck.positions)
+
+
+def test_weights_seed_and_beta_of_a_round_reach_the_collectors_processes(cases, policy):
+    settings = replace(CONFIG, rollout_teams=4, backend="process", sample_rollouts=True)
+
+    def biased(action):
+        with torch.no_grad():
+            policy.head.bias.copy_(torch.eye(5)[action] * 100)
+
+    rounds = []
+    for _ in range(2):
+        aggregator = aggregating(settings, policy, cases)
+        try:
+            biased(Action.IDLE)
+            by_expert = aggregator.collect(0, 4 * 24)[0]
+            waiting = aggregator.collect(1, 4 * 24)[0]
+            biased(Action.UP)
+            rounds.append([by_expert, waiting, aggregator.collect(2, 4 * 24)[0]])
+        finally:
+            aggregator.close()
+    by_expert, waiting, climbing = rounds[0]
+    assert (np.diff(by_expert.positions.astype(int), axis=0) != 0).any()
+    starts = np.stack([case.starts for case in cases])
+    assert np.array_equal(waiting.positions, starts[waiting.cases])
+    rows = climbing.positions[..., 0].sum(axis=1)
+    assert (rows < starts[climbing.cases, :, 0].sum(axis=1)).any()
+    for once, again in zip(*rounds, strict=True):
+        assert np.array_equal(once.positions, again.positions)
+
+
+def test_collectors_side_by_side_play_other_episodes(cases, policy):
+    settings = replace(CONFIG, rollout_teams=4, backend="process", collectors=2)
+    aggregator = aggregating(settings, policy, cases)
+    try:
+        states, _ = aggregator.collect(1, 4 * 24)
+    finally:
+        aggregator.close()
+    assert len(states) == 4 * 24
+    halves = states.positions.reshape(2, -1)
+    assert not np.array_equal(*halves)
+
+
+def test_teams_are_shared_evenly_by_collectors(cases, policy):
+    with pytest.raises(ValueError, match="multiple of its 2 collectors, got 5"):
+        aggregating(replace(CONFIG, backend="process", collectors=2), policy, cases)
+    with pytest.raises(ValueError, match='backend "process" or "ray"'):
+        replace(CONFIG, collectors=2)
 
 
 def test_the_mixture_reads_what_the_environment_writes(policy, cases):

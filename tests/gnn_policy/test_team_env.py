@@ -31,6 +31,22 @@ def acting(env, state, actions):
 def test_torchrl_finds_the_specs_right(cases, dtype):
     check_env_specs(TeamEnv(4, max_cycles=5, dtype=dtype, **SETTINGS))
     check_env_specs(TeamEnv(3, cases, max_cycles=5, dtype=dtype))
+    check_env_specs(TeamEnv(3, cases, max_cycles=5, dtype=dtype, shield="pibt"))
+
+
+def test_under_pibt_it_steps_by_the_values_of_moves(cases):
+    generator = np.random.default_rng(1)
+    env = TeamEnv(6, cases, max_cycles=7, fov_radius=2, comm_radius=2.5, shield="pibt")
+    twin = BatchedEnv(6, max_cycles=7, shield="pibt", **SETTINGS)
+    state = env.reset(seed=11)
+    twin.reset(11, instances=[cases[i] for i in state[CASE].tolist()])
+    for _ in range(7):
+        values = generator.normal(size=(6, 3, 5)).astype(np.float32)
+        state, outcome = acting(env, state, values), twin.step(values)
+        assert np.array_equal(state[POSITIONS].numpy(), twin.positions)
+        assert np.array_equal(state[FOV].numpy(), outcome.observation.fov)
+        if state["done"].any():
+            break
 
 
 def test_it_steps_as_the_batched_environment_does(cases):

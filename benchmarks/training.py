@@ -1,0 +1,213 @@
+"""Where the time of training goes, and how fast it is with other encoders, precisions, threads and processes.
+
+    python benchmarks/training.py round       the parts of a round, one thread
+    python benchmarks/training.py steps       gradient steps with each encoder, convolution and precision, one thread
+    python benchmarks/training.py processes   gradient steps with threads, and with processes under torchrun
+
+"Overhead" is all of a round that is neither the network nor the expert nor the environment: batches rebuilt from
+positions, TorchRL's collector and loss module, our own loops. The network's parts are timed by themselves before and
+after the rounds, on batches like theirs. Nothing else may run on the machine meanwhile.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import AutoresetMode
+from rich.console import Console
+from torch import nn
+from torch.nn.functional import cross_entropy
+
+from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.convolution import StridedConvolution
+from gnn_policy.network import ENCODERS, DecentralizedPolicy
+from gnn_policy.precision import Precision, autocast
+from gnn_policy.progress import TrainingProgress
+from gnn_policy.training import Training
+from mapf_env import BatchedEnv
+
+ROUNDS = 5
+UPDATES = 200
+CONFIG = replace(
+    RECIPES["quick"],
+    epochs=ROUNDS + 1,
+    train_maps=500,
+    validation_maps=1,
+    validation_cases_per_map=1,
+    validate_every=ROUNDS + 1,
+    threads=1,
+)
+CPU = torch.device("cpu")
+
+
+def median_seconds(action: Callable[[], object], repeats: int = 5, times: int = 20) -> float:
+    """Of one call, after a warm-up."""
+    action()
+    taken = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        for _ in range(times):
+            action()
+        taken.append((time.perf_counter() - began) / times)
+    return float(np.median(taken))
+
+
+def gradient_step(policy: DecentralizedPolicy, config: TrainConfig) -> Callable[[], None]:
+    """A step of the network and the optimiser on one batch that is ready."""
+    B, N, side = config.batch_size, config.num_agents, 2 * config.policy.fov_radius + 3
+    rng = torch.Generator().manual_seed(0)
+    fov = (torch.rand(B, N, config.policy.channels, side, side, generator=rng) < 0.1).to(torch.uint8)
+    graph = (torch.rand(B, N, N, generator=rng) < 0.2).float()
+    labels = torch.randint(5, (B * N,), generator=rng)
+    optimizer = torch.optim.Adam(policy.parameters(), config.lr, weight_decay=config.weight_decay, fused=True)
+    policy.train()
+
+    def step() -> None:
+        with autocast(config.precision, CPU):
+            logits = policy(fov, graph)
+        optimizer.zero_grad()
+        cross_entropy(logits.flatten(0, 1).float(), labels).backward()
+        optimizer.step()
+
+    return step
+
+
+def forward_pass(policy: DecentralizedPolicy, config: TrainConfig) -> Callable[[], None]:
+    """The network's part of a step of all teams of a rollout."""
+    B, N, side = config.rollout_teams, config.num_agents, 2 * config.policy.fov_radius + 3
+    fov, graph = torch.zeros(B, N, config.policy.channels, side, side, dtype=torch.uint8), torch.zeros(B, N, N)
+    policy.eval()
+
+    def play() -> None:
+        with torch.inference_mode(), autocast(config.precision, CPU):
+            policy(fov, graph)
+
+    return play
+
+
+def environment_step(config: TrainConfig) -> Callable[[], None]:
+    """The environment's part of it."""
+    teams = BatchedEnv(
+        config.rollout_teams, num_agents=config.num_agents, dtype="uint8", autoreset=AutoresetMode.NEXT_STEP
+    )
+    teams.reset(0)
+    actions = np.random.default_rng(0).integers(0, 5, (config.rollout_teams, config.num_agents))
+    return lambda: teams.step(actions) and None
+
+
+def parts_of_a_round() -> None:
+    """One line for each part of a round of DAgger: seconds, and its share of the bare gradient steps."""
+    config = CONFIG
+    torch.set_num_threads(1)
+    updates, plays = config.updates_per_epoch or 0, config.dagger_steps / config.rollout_teams
+    policy = DecentralizedPolicy(config.policy)
+
+    def network() -> tuple[float, float, float]:
+        return (
+            updates * median_seconds(gradient_step(policy, config)),
+            plays * median_seconds(forward_pass(policy, config)),
+            plays * median_seconds(environment_step(config)),
+        )
+
+    before = network()
+    with tempfile.TemporaryDirectory() as folder:
+        training = Training(config, Path(folder), TrainingProgress(config.epochs, Console(quiet=True)))
+        training.run()
+        rounds = training.history[1:]  # the first has no rollouts of the policy
+    steps, forward, environment = np.mean([before, network()], axis=0)
+    fit, collect, expert = (
+        float(np.median([getattr(row, name) for row in rounds]))
+        for name in ("fit_seconds", "collect_seconds", "expert_seconds")
+    )
+    rest = (fit - steps) + (collect - expert - forward - environment)
+    states = updates * config.batch_size * config.num_agents
+    print(f"{states:,} robot states in {updates} gradient steps of {config.num_agents} robots, one thread")
+    for name, seconds in (
+        ("network, gradient steps", steps),
+        ("network, rollouts", forward),
+        ("expert", expert),
+        ("environment", environment),
+        ("batches and loss module", fit - steps),
+        ("collector", collect - expert - forward - environment),
+        ("overhead (the last two)", rest),
+        ("round", fit + collect),
+    ):
+        print(f"{name:26} {seconds:7.2f} s  {seconds / steps:6.1%} of the gradient steps")
+    print(f"{states / (fit + collect):,.0f} robot states a second, all in")
+
+
+def speed_of_steps() -> None:
+    """Robot states a second of bare gradient steps."""
+    torch.set_num_threads(1)
+    precisions: tuple[Precision, ...] = ("float32", "bfloat16")
+    for encoder in ENCODERS:
+        for library in (False, True) if encoder == "lean" else (True,):
+            for precision in precisions:
+                config = replace(CONFIG, policy=replace(CONFIG.policy, encoder=encoder), precision=precision)
+                policy = DecentralizedPolicy(config.policy)
+                if library and encoder == "lean":
+                    with_library_convolutions(policy)
+                rate = config.batch_size * config.num_agents / median_seconds(gradient_step(policy, config))
+                kind = "the library's convolutions" if library else "products of matrices"
+                print(f"{encoder:9} {kind:27} {precision:9} {rate:9,.0f} robot states a second", flush=True)
+
+
+def with_library_convolutions(policy: DecentralizedPolicy) -> None:
+    """Put PyTorch's own convolutions in place of ours."""
+    for name, module in list(policy.encoder.named_children()):
+        if isinstance(module, StridedConvolution):
+            channels, width = module.weight.shape[1], module.weight.shape[0]
+            setattr(policy.encoder, name, nn.Conv2d(channels, width, 3, 2, 1).to(memory_format=torch.channels_last))
+
+
+def fitted(run: Path, processes: int, threads: int) -> float:
+    """Robot states a second in the gradient steps of the quick recipe's batch."""
+    settings = f"""
+        --epochs 1 --updates-per-epoch {UPDATES} --train-maps 100 --validation-maps 1 --validation-cases-per-map 1
+        --test-maps 1 --cases-per-map 1 --demonstration-steps 8192 --dagger-every 0
+    """
+    start = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), "-m"]
+    command = [*(start if processes > 1 else ["-m"]), "gnn_policy.train", *(["--"] if processes > 1 else [])]
+    done = subprocess.run(
+        [sys.executable, *command, "--run", str(run), "--threads", str(threads), *settings.split()],
+        env={**os.environ, "OMP_NUM_THREADS": str(threads)},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    with (run / "metrics.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    return int(row["samples"]) / float(row["fit_seconds"])
+
+
+def threads_and_processes() -> None:
+    """A line for each way to use two cores."""
+    with tempfile.TemporaryDirectory() as folder:
+        for processes, threads in ((1, 1), (1, 2), (2, 1)):
+            rate = fitted(Path(folder, f"{processes}-{threads}"), processes, threads)
+            print(f"{processes} processes, {threads} threads each: {rate:,.0f} robot states a second", flush=True)
+
+
+TABLES = {"round": parts_of_a_round, "steps": speed_of_steps, "processes": threads_and_processes}
+
+
+def main(table: tyro.conf.Positional[Literal["round", "steps", "processes"]], /) -> None:
+    """Print one of the tables."""
+    TABLES[table]()
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
