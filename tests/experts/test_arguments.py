@@ -73,9 +73,19 @@ CALLS: dict[str, Any] = {
         {"solution": SOLUTION},
         {"solution": OBJECT, "lower_bound": (*INTEGER, -1), "seconds": (*NUMBER, -1.0)},
     ),
+    "load_paths": (experts.load_paths, {"path": "a.paths"}, {"path": PATH}),
+    "save_paths": (experts.save_paths, {"path": "b.paths", "solution": SOLUTION}, {"path": PATH, "solution": OBJECT}),
 }
 
 
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is read, in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    experts.save_paths("a.paths", SOLUTION)
+
+
+@pytest.mark.usefixtures("files")
 @pytest.mark.parametrize(("call", "sound", "argument", "wrong"), table(CALLS))
 def test_wrong_arguments_are_refused_by_name(
     call: Callable[..., Any], sound: dict[str, Any], argument: str, wrong: tuple[Any, ...]
@@ -83,28 +93,8 @@ def test_wrong_arguments_are_refused_by_name(
     assert_refused(call, sound, argument, wrong)
 
 
-FILES: dict[str, Any] = {
-    "load_paths": (experts.load_paths, {"path": "a.paths"}, {"path": PATH}),
-    "save_paths": (experts.save_paths, {"path": "b.paths", "solution": SOLUTION}, {"path": PATH, "solution": OBJECT}),
-}
-
-
-@pytest.mark.parametrize(("call", "sound", "argument", "wrong"), table(FILES))
-def test_wrong_arguments_of_readers_and_writers_are_refused_by_name(
-    call: Callable[..., Any],
-    sound: dict[str, Any],
-    argument: str,
-    wrong: tuple[Any, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    experts.save_paths("a.paths", SOLUTION)
-    assert_refused(call, sound, argument, wrong)
-
-
 def test_every_public_call_is_among_these() -> None:
-    found = {name.partition(".")[0] for name in (*CALLS, *FILES)}
+    found = {name.partition(".")[0] for name in CALLS}
     assert found | {"Solver", "Status"} == set(experts.__all__)
 
 

@@ -253,17 +253,6 @@ CALLS: dict[str, Any] = {
     "instance_hash": (mapf_env.instance_hash, {"instance": INSTANCE}, {"instance": OBJECT}),
     "parse_map": (mapf_env.parse_map, {"drawing": "A.a"}, {"drawing": (*STRING, "")}),
     "parse_instance": (mapf_env.parse_instance, {"drawing": "A.a"}, {"drawing": (*STRING, "")}),
-}
-
-
-@pytest.mark.parametrize(("call", "sound", "argument", "wrong"), table(CALLS))
-def test_wrong_arguments_are_refused_by_name(
-    call: Callable[..., Any], sound: dict[str, Any], argument: str, wrong: tuple[Any, ...]
-) -> None:
-    assert_refused(call, sound, argument, wrong)
-
-
-FILES: dict[str, Any] = {
     "load_map": (mapf_env.load_map, {"path": "a.map"}, {"path": PATH}),
     "save_map": (mapf_env.save_map, {"path": "b.map", "grid": GRID}, {"path": PATH, "grid": ARRAY}),
     "load_scen": (
@@ -285,24 +274,25 @@ FILES: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize(("call", "sound", "argument", "wrong"), table(FILES))
-def test_wrong_arguments_of_readers_and_writers_are_refused_by_name(
-    call: Callable[..., Any],
-    sound: dict[str, Any],
-    argument: str,
-    wrong: tuple[Any, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is read, in the working folder."""
     monkeypatch.chdir(tmp_path)
     mapf_env.save_map("a.map", GRID)
     mapf_env.save_scen("a.scen", INSTANCE, "a.map")
     mapf_env.save_instances("a.json", [INSTANCE])
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize(("call", "sound", "argument", "wrong"), table(CALLS))
+def test_wrong_arguments_are_refused_by_name(
+    call: Callable[..., Any], sound: dict[str, Any], argument: str, wrong: tuple[Any, ...]
+) -> None:
     assert_refused(call, sound, argument, wrong)
 
 
 def test_every_public_call_is_among_these() -> None:
-    found = {name.partition(".")[0] for name in (*CALLS, *FILES)}
+    found = {name.partition(".")[0] for name in CALLS}
     given_by_the_world = {
         "Action",
         "Conflict",
