@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from numbers import Real
 from typing import Any, TypeVar
 
@@ -105,9 +106,9 @@ def shaped(
 
     `meaning` is what the message says after the shape; `filled`, that no axis may have length 0.
     """
-    found, wanted = array(values, name), shape.strip("()").rstrip(",").split(",")
-    lengths = zip(wanted, found.shape, strict=False)
-    fits = all(int(axis) == length if axis.strip().isdigit() else length or not filled for axis, length in lengths)
+    found, wanted = array(values, name), _axes(shape)
+    pairs = zip(wanted, found.shape, strict=False)
+    fits = all(length == asked if asked is not None else length or not filled for asked, length in pairs)
     if found.ndim != len(wanted) or not fits:
         raise ValueError(f"{name} must have shape {shape}{meaning}, got {found.shape}")
     return found
@@ -122,6 +123,13 @@ def cells(
         raise TypeError(f"{name} must be integers, got dtype {found.dtype}")
     within = found if found.dtype == np.int32 else np.clip(found, _INT32.min, _INT32.max)
     return np.array(within, np.int32, order="C")
+
+
+@cache
+def _axes(shape: str) -> tuple[int | None, ...]:
+    """The lengths that a shape like "(B, N, 2)" asks for, None where any will do."""
+    axes = [axis.strip() for axis in shape.strip("()").split(",") if axis]
+    return tuple(int(axis) if axis.isdigit() else None for axis in axes)
 
 
 def _as_int(value: object, name: str) -> int:
