@@ -9,23 +9,11 @@ from __future__ import annotations
 import argparse
 import json
 import random
-import time
-from collections.abc import Callable
 from itertools import cycle
 from typing import Any
 
+from cpu_clock import calls_per_second
 from pogema import GridConfig, pogema_v0  # pyright: ignore[reportMissingImports]
-
-
-def calls_per_second(call: Callable[[], Any], seconds: float) -> float:
-    """How often `call` runs in a CPU second; as in `speed.py`."""
-    call()
-    calls, began = 0, time.process_time()
-    while time.process_time() - began < seconds:
-        for _ in range(16):
-            call()
-        calls += 16
-    return calls / (time.process_time() - began)
 
 
 def main() -> None:

@@ -7,20 +7,18 @@ Swaps are forbidden, which w9-pathfinding does not do by itself; set-up is part 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import subprocess
 import sys
 import time
-import venv
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from peer_venv import peer_python
+
 if TYPE_CHECKING:
     from mapf_env import Instance
 
-VENV = Path(__file__).resolve().parent.parent / ".cache" / "solver-peers-venv"
 PACKAGES = ("w9-pathfinding==0.1.3", "pymapf==0.9.0")
 
 Row = tuple[str, list[float], list[int | None]]
@@ -32,21 +30,9 @@ def python() -> Path:
 
     Raises:
         subprocess.CalledProcessError: If they cannot be installed.
+        OSError: If no environment can be made.
     """
-    interpreter = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-    check = "import w9_pathfinding, pymapf"
-    if interpreter.exists() and subprocess.run([interpreter, "-c", check], capture_output=True).returncode == 0:
-        return interpreter
-    uv = shutil.which("uv")
-    if uv:
-        commands = [[uv, "venv", "--clear", "--python", sys.executable, str(VENV)]]
-        commands.append([uv, "pip", "install", "--python", str(interpreter), *PACKAGES])
-    else:
-        venv.create(VENV, clear=True, with_pip=True)
-        commands = [[str(interpreter), "-m", "pip", "install", *PACKAGES]]
-    for command in commands:
-        subprocess.run(command, capture_output=True, text=True, check=True)
-    return interpreter
+    return peer_python("solver-peers-venv", PACKAGES, ["w9_pathfinding", "pymapf"])
 
 
 def measure(interpreter: Path, instances: list[Instance], time_limit: float) -> list[Row]:

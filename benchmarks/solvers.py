@@ -52,7 +52,7 @@ def main() -> None:
         ("peers", peers),
     ):
         summary = (run.__doc__ or "").splitlines()[0]
-        command = commands.add_parser(name, help=summary, description=summary, parents=[shared])
+        command = commands.add_parser(name, help=summary.replace("%", "%%"), description=summary, parents=[shared])
         command.set_defaults(run=run)
         if name == "movingai":
             command.add_argument("--data", type=Path, help="the folder of the .scen and .map files")

@@ -11,12 +11,10 @@ from __future__ import annotations
 import json
 import os
 import platform
-import shutil
 import statistics
 import subprocess
 import sys
 import time
-import venv
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,6 +25,8 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
+from cpu_clock import calls_per_second
+from peer_venv import CACHE, peer_python
 from rich import box
 from rich.console import Console
 from rich.progress import Progress
@@ -35,7 +35,6 @@ from rich.table import Table
 import mapf_env
 
 ROOT = Path(__file__).parents[1]
-PEER_VENV = ROOT / ".cache" / "pogema-venv"
 PEER = "pogema==1.4.0"
 
 Dtype = Literal["float32", "uint8"]
@@ -103,17 +102,6 @@ class Competitor:
     """The bare loop that writes the same bytes, of which it is a share."""
 
 
-def calls_per_second(call: Callable[[], object], seconds: float) -> float:
-    """How often `call` runs in a CPU second; the clock, as slow as a short call, is read after every 16th."""
-    call()
-    calls, began = 0, time.process_time()
-    while time.process_time() - began < seconds:
-        for _ in range(16):
-            call()
-        calls += 16
-    return calls / (time.process_time() - began)
-
-
 def batched(
     options: Options, dtype: Dtype = "float32", *, own_memory: bool = False, **settings: Any
 ) -> Callable[[int], Rates]:
@@ -170,7 +158,7 @@ def compiled_bare_loop() -> Path:
         CalledProcessError: If it does not compile.
         OSError: If there is no compiler.
     """
-    program = PEER_VENV.parent / "bare_loop"
+    program = CACHE / "bare_loop"
     program.parent.mkdir(exist_ok=True)
     source = str(ROOT / "benchmarks" / "bare_loop.cpp")
     flags = ["-O3", "-march=native", "-std=c++20", "-pthread"]
@@ -243,29 +231,6 @@ def pogema(options: Options, interface: Literal["list", "pettingzoo"], python: P
     return measure
 
 
-def peer_python() -> Path:
-    """The interpreter of POGEMA's virtual environment, which is made if there is none.
-
-    Raises:
-        subprocess.CalledProcessError: If POGEMA cannot be installed.
-    """
-    python = PEER_VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-    if python.exists() and subprocess.run([python, "-c", "import pogema"], capture_output=True).returncode == 0:
-        return python
-    uv = shutil.which("uv")
-    if uv:
-        commands = [
-            [uv, "venv", "--clear", "--python", ">=3.11,<3.13", str(PEER_VENV)],
-            [uv, "pip", "install", "--python", str(python), PEER],
-        ]
-    else:
-        venv.create(PEER_VENV, clear=True, with_pip=True)
-        commands = [[str(python), "-m", "pip", "install", PEER]]
-    for command in commands:
-        subprocess.run(command, capture_output=True, text=True, check=True)
-    return python
-
-
 def competitors(options: Options, console: Console, program: Path | None) -> list[Competitor]:
     """Who takes part; ours only, with a warning, if POGEMA cannot be installed."""
     peer, view = "POGEMA, list API", "POGEMA, PettingZoo"
@@ -289,8 +254,8 @@ def competitors(options: Options, console: Console, program: Path | None) -> lis
     if not options.pogema:
         return ours
     try:
-        with console.status(f"{PEER} in {PEER_VENV.relative_to(ROOT)}"):
-            python = peer_python()
+        with console.status(f"{PEER} in an environment of its own"):
+            python = peer_python("pogema-venv", [PEER], ["pogema"], python=">=3.11,<3.13")
     except (subprocess.CalledProcessError, OSError) as error:
         reason = str(getattr(error, "stderr", None) or error).strip()
         console.print(f"[bold red]POGEMA is not measured: {PEER} could not be installed.[/]\n{reason}")

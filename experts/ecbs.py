@@ -39,7 +39,7 @@ def solve(
         TypeError: If an argument has the wrong type.
         KeyboardInterrupt: At Ctrl-C, which stops the search.
     """
-    arguments.require_instance(instance, "instance")
+    arguments.instance_of(instance, Instance, "instance")
     return solve_batch([instance], w=w, threads=1, time_limit=time_limit, node_limit=node_limit, seed=seed)[0]
 
 
@@ -52,7 +52,7 @@ def solve_batch(
         arguments.suboptimality(w),
         arguments.seconds(time_limit),
         arguments.at_least_one(node_limit, "node_limit"),
-        arguments.seed_number(seed),
-        arguments.at_least_one(threads, "threads", maximum=arguments.MAX_THREADS),
+        arguments.seed(seed),
+        arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS),
     )
     return [as_result(part) for part in parts]

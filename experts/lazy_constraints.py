@@ -39,7 +39,7 @@ def lacam(
         TypeError: If an argument has the wrong type.
         KeyboardInterrupt: At Ctrl-C.
     """
-    arguments.require_instance(instance, "instance")
+    arguments.instance_of(instance, Instance, "instance")
     parts = _native.lacam(
         instance.grid,
         instance.starts,
@@ -47,6 +47,6 @@ def lacam(
         w if w == math.inf else arguments.suboptimality(w),
         arguments.seconds(time_limit),
         arguments.at_least_one(node_limit, "node_limit"),
-        arguments.seed_number(seed),
+        arguments.seed(seed),
     )
     return as_result(parts)

@@ -62,7 +62,7 @@ def solve_many(
             no `Result`.
         KeyboardInterrupt: At Ctrl-C, which stops ECBS at once; of other solvers those that are running finish first.
     """
-    problems = arguments.all_instances(instances)
+    problems = list(arguments.each_of(instances, Instance, "instances"))
     return list(
         solve_stream(
             problems,
@@ -116,19 +116,22 @@ def solve_stream(
     limits = {
         "time_limit": arguments.seconds(time_limit),
         "node_limit": arguments.at_least_one(node_limit, "node_limit"),
-        "seed": arguments.seed_number(seed),
+        "seed": arguments.seed(seed),
     }
     arguments.suboptimality(w)
-    threads = arguments.at_least_one(threads, "threads", maximum=arguments.MAX_THREADS)
+    threads = arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS)
     backlog = arguments.at_least_one(backlog, "backlog")
+    problems = arguments.each_of(instances, Instance, "instances")
+    if progress is not None and not callable(progress):
+        raise TypeError(f"progress must be a function of two numbers, got {progress!r}")
     if solver == "ecbs":
         batch = partial(solve_batch, w=w, threads=threads, **limits)
-        results = _in_batches(_checked(instances), batch, backlog)
+        results = _in_batches(problems, batch, backlog)
     else:
         single = solver_named(solver, w=w, **limits) if isinstance(solver, str) else solver
         if not callable(single):
             raise TypeError(f"solver must be one of {', '.join(SOLVER_NAMES)} or a function, got {solver!r}")
-        results = _in_pool(_checked(instances), single, threads, backlog)
+        results = _in_pool(problems, single, threads, backlog)
     return results if progress is None else _reporting(results, progress)
 
 
@@ -144,12 +147,6 @@ def solver_named(name: str, *, w: float, time_limit: float, node_limit: int, see
         case "pibt":
             return partial(pibt, seed=seed)
     raise ValueError(f"solver must be one of {', '.join(SOLVER_NAMES)} or a function, got {name!r}")
-
-
-def _checked(instances: Iterable[Instance]) -> Iterator[Instance]:
-    for index, instance in enumerate(instances):
-        arguments.require_instance(instance, f"instances[{index}]")
-        yield instance
 
 
 def _in_batches(

@@ -6,11 +6,11 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 
-from mapf_env.files import PathLike, write_whole
+from mapf_env import arguments
+from mapf_env.files import PathLike, as_path, write_whole
 from mapf_env.solution import Solution
 
 _LINE = re.compile(r"Agent (\d{1,9}):((?:\s*\(\d{1,9},\d{1,9}\)(?:->)?)+)\s*")
@@ -21,8 +21,10 @@ def save_paths(path: PathLike, solution: Solution) -> None:
     """Write the solution's paths, each up to the robot's arrival.
 
     Raises:
+        TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written; an existing one is then unchanged.
     """
+    arguments.instance_of(solution, Solution, "solution")
     lines = []
     for agent, arrival in enumerate(solution.arrivals):
         cells = solution.paths[: arrival + 1, agent].tolist()
@@ -37,7 +39,7 @@ def load_paths(path: PathLike) -> Solution:
         ValueError: If a line is damaged or a robot is missing; the message names the file and the line.
         OSError: If the file cannot be read.
     """
-    lines = Path(path).read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    lines = as_path(path).read_text(encoding="utf-8-sig", errors="replace").splitlines()
     tracks: list[list[tuple[int, int]]] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip():

@@ -35,13 +35,13 @@ def prioritised(
         TypeError: If an argument has the wrong type.
         KeyboardInterrupt: At Ctrl-C.
     """
-    arguments.require_instance(instance, "instance")
+    arguments.instance_of(instance, Instance, "instance")
     parts = _native.prioritised(
         instance.grid,
         instance.starts,
         instance.goals,
         arguments.at_least_one(max_orders, "max_orders", maximum=arguments.MAX_ORDERS),
         arguments.seconds(time_limit),
-        arguments.seed_number(seed),
+        arguments.seed(seed),
     )
     return as_result(parts)

@@ -28,12 +28,12 @@ def pibt(instance: Instance, *, max_steps: int = arguments.DEFAULT_MAX_STEPS, se
         TypeError: If an argument has the wrong type.
         KeyboardInterrupt: At Ctrl-C.
     """
-    arguments.require_instance(instance, "instance")
+    arguments.instance_of(instance, Instance, "instance")
     parts = _native.pibt(
         instance.grid,
         instance.starts,
         instance.goals,
         arguments.at_least_one(max_steps, "max_steps", maximum=arguments.MAX_STEPS),
-        arguments.seed_number(seed),
+        arguments.seed(seed),
     )
     return as_result(parts)

@@ -45,12 +45,12 @@ def relabel(
         TypeError: If an argument has the wrong type.
         KeyboardInterrupt: At Ctrl-C.
     """
-    states = _as_states(positions)
+    states = arguments.cells(positions, "positions", "(B, N, 2)", ": N cells for each of B states")
     if isinstance(instances, Instance):
         problems = [instances]
         problem_of = np.zeros(len(states), dtype=np.int64)
     else:
-        problems, problem_of = _distinct(arguments.all_instances(instances))
+        problems, problem_of = _distinct(list(arguments.each_of(instances, Instance, "instances")))
         if len(problem_of) != len(states):
             raise ValueError(
                 f"{len(problem_of)} instances but positions of {len(states)} states: give one instance for each state, "
@@ -68,21 +68,9 @@ def relabel(
         states,
         arguments.suboptimality(w),
         arguments.at_least_one(node_limit, "node_limit"),
-        arguments.seed_number(seed),
-        arguments.at_least_one(threads, "threads", maximum=arguments.MAX_THREADS),
+        arguments.seed(seed),
+        arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS),
     )
-
-
-def _as_states(positions: npt.ArrayLike) -> npt.NDArray[np.int32]:
-    array = np.asarray(positions)
-    if array.ndim != 3 or array.shape[2] != 2:
-        raise ValueError(f"positions must have shape (B, N, 2): N cells for each of B states, got {array.shape}")
-    if not np.issubdtype(array.dtype, np.integer):
-        raise TypeError(f"positions must be integers, got dtype {array.dtype}")
-    if array.dtype == np.int32:
-        return np.ascontiguousarray(array)
-    bounds = np.iinfo(np.int32)
-    return np.ascontiguousarray(np.clip(array, bounds.min, bounds.max), dtype=np.int32)
 
 
 def _distinct(instances: list[Instance]) -> tuple[list[Instance], npt.NDArray[np.int64]]:

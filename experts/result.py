@@ -8,6 +8,7 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
+from mapf_env import arguments
 from mapf_env.solution import Solution
 
 
@@ -45,7 +46,16 @@ class Result:
 
     @classmethod
     def of(cls, solution: Solution, *, lower_bound: int = 0, seconds: float = 0.0) -> Result:
-        """What a solver of your own answers: a solution, and the lower bound it has proved, if any."""
+        """What a solver of your own answers: a solution, and the lower bound it has proved, if any.
+
+        Raises:
+            ValueError: If a number is negative.
+            TypeError: If an argument has the wrong type.
+        """
+        arguments.instance_of(solution, Solution, "solution")
+        arguments.integer(lower_bound, "lower_bound", 0)
+        if not arguments.number(seconds, "seconds") >= 0:
+            raise ValueError(f"seconds must not be negative, got {seconds}")
         return cls(Status.SOLVED, solution, solution.sum_of_costs, lower_bound, 0, 0, seconds)
 
     @property

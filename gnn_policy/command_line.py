@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-MAX_THREADS = 1024
+from mapf_env.arguments import MOST_THREADS
 
 
 @contextmanager
@@ -25,8 +25,8 @@ def mistakes_in_one_line() -> Iterator[None]:
 
 def cpu_threads(asked: int) -> int:
     """`asked`, or for 0 as many threads as the process may use."""
-    if not 0 <= asked <= MAX_THREADS:
-        raise ValueError(f"threads must lie in 0..{MAX_THREADS}, got {asked}")
+    if not 0 <= asked <= MOST_THREADS:
+        raise ValueError(f"threads must lie in 0..{MOST_THREADS}, got {asked}")
     if asked > 0:
         return asked
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 
+from mapf_env import arguments
 from mapf_env.instance import Instance, Obstacles
 
 
@@ -43,7 +44,7 @@ def parse_instance(drawing: str) -> Instance:
 
 
 def _characters(drawing: str) -> np.ndarray[tuple[int, int], np.dtype[np.str_]]:
-    lines = [line.strip() for line in drawing.strip().splitlines()]
+    lines = [line.strip() for line in arguments.instance_of(drawing, str, "drawing").strip().splitlines()]
     if not lines:
         raise ValueError("the drawing has no cells; draw at least one line")
     for number, line in enumerate(lines, start=1):

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 
-from mapf_env import _native, rules
+from mapf_env import _native, arguments, rules
 from mapf_env.config import CHANNELS, EnvConfig
-from mapf_env.generation import random_cases, random_maps
 from mapf_env.instance import Instance
+from mapf_env.instance_source import InstanceSource
 from mapf_env.team_state import TeamState
 
 _FLOAT = np.dtype(np.float32)
-_Cases = tuple[npt.NDArray[np.bool_], rules.Positions, rules.Positions, npt.NDArray[np.int32]]
-"""Grids (M, H, W), starts and goals (M, N, 2) and how many robots are there (M,)."""
 
 
 class Observation(NamedTuple):
@@ -65,12 +64,13 @@ class BatchedEnv:
             `Step.final_observation` has the last ones of those that ended.
         cases: Instances to play, drawn anew at each reset by the seed, in place of random ones.
         fill: Take instances that are smaller than the environment too: the map is filled up with obstacles, and the
-            robots that are not there have zeros everywhere; `present` says which are.
+            robots that are not there have zeros everywhere, but for the action mask, which leaves them idle, so that a
+            masked choice is always defined; `present` says which are there.
         settings: Fields of `EnvConfig`.
 
     Raises:
-        ValueError: If a setting is out of range.
-        TypeError: If a setting is unknown.
+        ValueError: If a setting is out of range, or a case does not fit.
+        TypeError: If a setting is unknown or of a wrong type.
     """
 
     def __init__(
@@ -83,18 +83,15 @@ class BatchedEnv:
         fill: bool = False,
         **settings: Any,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        if threads < 1:
-            raise ValueError(f"threads must be at least 1, got {threads}")
-        if cases is not None and not cases:
-            raise ValueError("there are no cases to play: give some, or None for random instances")
-        self.num_envs, self.threads, self.fill = num_envs, threads, fill
-        self.autoreset = AutoresetMode(autoreset)
+        self.num_envs = num_envs = arguments.integer(num_envs, "num_envs", 1, arguments.MOST_INT)
+        self.threads = arguments.integer(threads, "threads", 1, arguments.MOST_THREADS)
+        try:
+            self.autoreset = AutoresetMode(autoreset)
+        except ValueError:
+            modes = ", ".join(f"AutoresetMode.{mode.name}" for mode in AutoresetMode)
+            raise ValueError(f"autoreset must be one of {modes}, got {autoreset!r}") from None
         self.config = config = EnvConfig(**settings)
-        self._cases = cases
-        if cases is not None:
-            self._stack(cases)  # refuses what does not fit
+        self._source = InstanceSource(config, cases, fill)
         self._fov_shape = (num_envs, config.num_agents, config.num_channels, config.fov_side, config.fov_side)
         self._graph_shape = (num_envs, config.num_agents, config.num_agents)
         self._dtype = np.dtype(config.dtype)
@@ -115,7 +112,7 @@ class BatchedEnv:
             comm_radius=config.comm_radius,
             connected=config.comm_range == "connected",
             extras=[CHANNELS.index(channel) for channel in config.extra_channels],
-            rewards=list(config.rewards),
+            rewards=list(astuple(config.rewards)),
             threads=self.threads,
         )
 
@@ -158,7 +155,11 @@ class BatchedEnv:
 
     @property
     def present(self) -> npt.NDArray[np.bool_]:
-        """(B, N) which robots are there."""
+        """(B, N) which robots are there.
+
+        Like all properties that is the state now. With autoreset SAME_STEP a step that ends leaves the next episode
+        here: what was read before the step says whom its rewards and its `final_observation` are of.
+        """
         return np.arange(self.num_agents) < self._state.team_sizes[:, None]
 
     @property
@@ -191,6 +192,7 @@ class BatchedEnv:
         Raises:
             ValueError: If a length or shape does not fit, or an instance is of another size than the environment;
                 the environments are then as they were.
+            TypeError: If a seed is no integer, an instance none, or the memory of another dtype.
         """
         chosen = np.arange(self.num_envs) if mask is None else np.flatnonzero(self._checked_mask(mask))
         self._begin(chosen, None if seed is None else self._checked_seeds(seed)[chosen], instances)
@@ -207,16 +209,10 @@ class BatchedEnv:
             if new.any():  # drawn no sooner than here, so that copies of an environment not yet begun differ
                 streams[new] = np.random.SeedSequence().generate_state(int(new.sum()), np.uint64)
         seeds = _native.mix(streams, episodes)
-        if instances is None and self._cases is not None:
-            draws = _native.mix(seeds, np.full_like(seeds, np.iinfo(np.uint64).max)) % np.uint64(len(self._cases))
-            instances = [self._cases[i] for i in draws.tolist()]
-        if instances is None:
-            cases = self._draw(seeds)
-        elif len(instances) == len(chosen):
-            cases = self._stack(instances)
-        else:
-            raise ValueError(f"{len(instances)} instances for {len(chosen)} environments: give one for each")
-        self.stepper.begin(chosen, seeds, *cases)
+        problems = self._source.draw(seeds) if instances is None else self._source.stack(instances, "instances")
+        if len(problems.grids) != len(chosen):
+            raise ValueError(f"{len(problems.grids)} instances for {len(chosen)} environments: give one for each")
+        self.stepper.begin(chosen, seeds, *problems)
         state.streams[chosen], state.episodes[chosen] = streams, episodes + np.uint64(1)
 
     def step(self, actions: npt.ArrayLike, out: Observation | None = None) -> Step:
@@ -234,7 +230,7 @@ class BatchedEnv:
             RuntimeError: Before the first reset, or if a team has ended and was not reset.
         """
         observation = self.buffers() if out is None else out
-        final = self.advance(np.asarray(actions), observation)
+        final = self.advance(arguments.array(actions, "actions"), observation)
         state = self._state
         return Step(
             observation,
@@ -261,16 +257,21 @@ class BatchedEnv:
                 final = Observation(*(np.asarray(part)[due] for part in out))
         if due.any():
             self._begin(np.flatnonzero(due), None, None)
-            self.stepper.observe(*out, due)
+            self._write_observation(out, due)
         return final
 
     def _execute(self, actions: npt.NDArray[Any], out: Observation, *, skip_ended: bool) -> None:
+        step: Callable[..., None]
         if actions.ndim == 3:
-            self.stepper.step_by_values(rules.as_values(actions), *out, skip_ended)
+            step, wanted = self.stepper.step_by_values, rules.as_values(actions)
         elif actions.ndim == 2:
-            self.stepper.step(rules.as_actions(actions), *out, skip_ended)
+            step, wanted = self.stepper.step, rules.as_actions(actions)
         else:
             raise ValueError(f"actions must have shape ({self.num_envs}, {self.num_agents}), got {actions.shape}")
+        try:
+            step(wanted, *out, skip_ended)
+        except TypeError:
+            raise self._no_memory() from None
 
     def observe(self, out: Observation | None = None) -> Observation:
         """What the robots perceive now.
@@ -284,8 +285,20 @@ class BatchedEnv:
 
     def _observe(self, out: Observation | None) -> Observation:
         observation = self.buffers() if out is None else out
-        self.stepper.observe(*observation, None)
+        self._write_observation(observation, None)
         return observation
+
+    def _write_observation(self, out: Observation, chosen: npt.NDArray[np.bool_] | None) -> None:
+        try:
+            self.stepper.observe(*out, chosen)
+        except TypeError:
+            raise self._no_memory() from None
+
+    def _no_memory(self) -> TypeError:
+        return TypeError(
+            f"out must be an Observation of contiguous memory as buffers() makes it: {self._dtype} for the views and "
+            "float32 for the graph"
+        )
 
     def edges(self, graph: npt.NDArray[np.float32]) -> rules.Edges:
         """The graph (B, N, N) of an observation as lists of edges, with each neighbour's relative position."""
@@ -296,45 +309,22 @@ class BatchedEnv:
         return self._state.on_goal.copy()
 
     def action_mask(self) -> npt.NDArray[np.int8]:
-        """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle."""
+        """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle; absent robots may idle."""
         self.stepper.write_action_masks()
         return self._state.action_mask.copy()
 
     def _checked_seeds(self, seed: int | Sequence[int]) -> npt.NDArray[np.uint64]:
-        seeds = [int(seed) + b for b in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
+        if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes):
+            seeds = [arguments.integer(each, f"seed[{b}]") for b, each in enumerate(seed)]
+        else:
+            first = arguments.integer(seed, "seed")
+            seeds = [first + b for b in range(self.num_envs)]
         if len(seeds) != self.num_envs or not all(0 <= each < 2**64 for each in seeds):
             raise ValueError(f"give one non-negative seed or {self.num_envs} of them, below 2**64, got {seed!r}")
         return np.array(seeds, np.uint64)
 
     def _checked_mask(self, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        array = np.asarray(mask)
+        array = arguments.array(mask, "mask")
         if array.shape != (self.num_envs,) or array.dtype != np.bool_:
             raise ValueError(f"mask must be bool of shape ({self.num_envs},), got {array.dtype} of shape {array.shape}")
         return array
-
-    def _draw(self, seeds: npt.NDArray[np.uint64]) -> _Cases:
-        config = self.config
-        grids = random_maps(seeds, height=config.height, width=config.width, density=config.density, style=config.style)
-        return grids, *random_cases(seeds, grids, config.num_agents), np.full(len(seeds), config.num_agents, np.int32)
-
-    def _stack(self, instances: Sequence[Instance]) -> _Cases:
-        config = self.config
-        grids = np.ones((len(instances), config.height, config.width), np.bool_)
-        starts, goals = (np.zeros((len(instances), config.num_agents, 2), np.int32) for _ in range(2))
-        sizes = np.empty(len(instances), np.int32)
-        for b, instance in enumerate(instances):
-            robots, (height, width) = instance.num_agents, instance.grid.shape
-            if robots > config.num_agents or (robots < config.num_agents and not self.fill):
-                raise ValueError(
-                    f"the instance has {robots} agents, the environment {config.num_agents}: "
-                    f"make it with num_agents={robots}"
-                )
-            small = height < config.height or width < config.width
-            if height > config.height or width > config.width or (small and not self.fill):
-                raise ValueError(
-                    f"the instance's map is {height}x{width}, the environment's {config.height}x{config.width}: "
-                    f"make it with height={height}, width={width}"
-                )
-            grids[b, :height, :width] = instance.grid
-            starts[b, :robots], goals[b, :robots], sizes[b] = instance.starts, instance.goals, robots
-        return grids, starts, goals, sizes

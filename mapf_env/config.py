@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
-from mapf_env.generation import Style, style_name
+from mapf_env import arguments
+from mapf_env.generation import Style, check_map, style_name
 from mapf_env.rewards import SCHEMES, Rewards
 
 Channel = Literal["cost_to_go", "other_goals", "previous_positions"]
@@ -29,7 +28,7 @@ class EnvConfig:
 
     Raises:
         ValueError: If a setting is out of its range, or the map has no room for the robots.
-        TypeError: If a whole number is none.
+        TypeError: If a number or a sequence of channels is none.
     """
 
     num_agents: int = 10
@@ -67,30 +66,23 @@ class EnvConfig:
     """The dtype of the views."""
 
     def __post_init__(self) -> None:
-        for name, least in (("num_agents", 1), ("height", 1), ("width", 1), ("fov_radius", 1), ("max_cycles", 1)):
-            value = getattr(self, name)
-            if not isinstance(value, int | np.integer):
-                raise TypeError(f"{name} must be an integer, got {value!r}")
-            if value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
-        if not 0.0 <= self.density < 1.0:
-            raise ValueError(f"density must lie in [0, 1), got {self.density}")
-        if not self.comm_radius >= 0.0:
+        for name in ("num_agents", "fov_radius", "max_cycles"):
+            arguments.integer(getattr(self, name), name, 1, arguments.MOST_INT)
+        check_map(self.height, self.width, self.density, self.fov_radius)
+        if not arguments.number(self.comm_radius, "comm_radius") >= 0.0:
             raise ValueError(f"comm_radius must not be negative, got {self.comm_radius}")
-        if not 0.0 <= self.message_loss <= 1.0:
-            raise ValueError(f"message_loss must lie in [0, 1], got {self.message_loss}")
+        arguments.share(self.message_loss, "message_loss")
         for name, known in _CHOICES.items():
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+            arguments.choice(getattr(self, name), known, name)
         if self.comm_range == "connected" and self.comm_radius == 0.0:
             raise ValueError('comm_radius must be positive to grow, got 0.0 with comm_range="connected"')
-        object.__setattr__(self, "extra_channels", tuple(self.extra_channels))
+        object.__setattr__(self, "extra_channels", tuple(arguments.each_of(self.extra_channels, str, "extra_channels")))
         unknown = [channel for channel in self.extra_channels if channel not in CHANNELS]
         if unknown or len(set(self.extra_channels)) < len(self.extra_channels):
             raise ValueError(f"extra_channels must be some of {', '.join(CHANNELS)}, got {self.extra_channels}")
         if "cost_to_go" in self.extra_channels and self.dtype == "uint8" and self.fov_radius > 63:
             raise ValueError(f"cost_to_go in uint8 needs a fov_radius of at most 63, got {self.fov_radius}")
-        if not isinstance(self.reward, Rewards) and self.reward not in SCHEMES:
+        if not isinstance(self.reward, Rewards) and (not isinstance(self.reward, str) or self.reward not in SCHEMES):
             raise ValueError(f"reward must be Rewards or one of {', '.join(SCHEMES)}, got {self.reward!r}")
         if style_name(self.style) not in ("cells", "walls"):
             return  # whether there is room shows when a map is drawn

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from mapf_env import _native
-from mapf_env.instance import Instance, Obstacles, as_obstacles
+from mapf_env import _native, arguments
+from mapf_env.instance import Instance, Obstacles, as_bool, as_obstacles
 
 MapStyle = Literal["cells", "walls", "maze", "room", "warehouse", "empty"]
 STYLES: tuple[MapStyle, ...] = ("cells", "walls", "maze", "room", "warehouse", "empty")
@@ -32,8 +32,7 @@ class Maze:
 
     def __post_init__(self) -> None:
         _check_parts(self)
-        if not 0.0 <= self.loops <= 1.0:
-            raise ValueError(f"the loops of a Maze must lie in [0, 1], got {self.loops}")
+        arguments.share(self.loops, "the loops of a Maze")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,12 +92,10 @@ def random_maps(
             `Maze()`, `Rooms()` and `Warehouse()`, whose fields are the sizes of their parts.
 
     Raises:
-        ValueError: If the density leaves no room, or the style cannot reach it.
+        ValueError: If the density leaves no room, or the style cannot reach it, or an argument is out of its range.
+        TypeError: If an argument has the wrong type.
     """
-    if height < 1 or width < 1:
-        raise ValueError(f"a map needs at least one row and one column, got height={height} and width={width}")
-    if not 0.0 <= density < 1.0:
-        raise ValueError(f"density must lie in [0, 1), got {density}")
+    check_map(height, width, density)
     number, parts = STYLES.index(style_name(style)), asdict(style) if not isinstance(style, str) else {}
     obstacles = round(density * height * width)
     return _native.random_maps(_as_seeds(seeds), height, width, obstacles, number, **parts)
@@ -113,11 +110,12 @@ def random_cases(
     region, over which they are uniform.
 
     Raises:
-        ValueError: If a region is too small for that many robots.
+        ValueError: If a region is too small for that many robots, or an argument is out of its range.
+        TypeError: If an argument has the wrong type.
     """
-    if num_agents < 1:
-        raise ValueError(f"num_agents must be at least 1, got {num_agents}")
-    return _native.place_agents(_as_seeds(seeds), np.ascontiguousarray(grids), num_agents)
+    robots = arguments.integer(num_agents, "num_agents", 1, arguments.MOST_INT)
+    maps = as_bool(arguments.shaped(grids, "grids", "(B, H, W)"), "grids")
+    return _native.place_agents(_as_seeds(seeds), maps, robots)
 
 
 def random_map(
@@ -142,7 +140,9 @@ def random_instance(
     The map depends on the seed and the map's arguments alone: another number of agents gives the same map.
 
     Raises:
-        ValueError: If the map has no room for the robots, or the density leaves none.
+        ValueError: If the map has no room for the robots, or the density leaves none, or an argument is out of its
+            range.
+        TypeError: If an argument has the wrong type.
     """
     seeds = np.array([_one_seed(seed)], dtype=np.uint64)
     if grid is None:
@@ -153,6 +153,19 @@ def random_instance(
     return Instance(grids[0], starts[0], goals[0])
 
 
+def check_map(height: int, width: int, density: float, border: int = 1) -> None:
+    """Raise ValueError or TypeError unless there are maps of that size and density."""
+    arguments.integer(height, "height", 1, arguments.MOST_INT)
+    arguments.integer(width, "width", 1, arguments.MOST_INT)
+    if (height + 2 * border) * (width + 2 * border) > arguments.MOST_INT:
+        raise ValueError(
+            f"a map of height {height} and width {width} with a border of {border} has more than "
+            f"{arguments.MOST_INT} cells: ask for a smaller one"
+        )
+    if not 0.0 <= arguments.number(density, "density") < 1.0:
+        raise ValueError(f"density must lie in [0, 1), got {density}")
+
+
 def style_name(style: Any) -> MapStyle:
     """The name of a style that is given by name or by its parts.
 
@@ -160,7 +173,7 @@ def style_name(style: Any) -> MapStyle:
         ValueError: If it is neither.
     """
     name = _STYLE_OF.get(type(style), style)
-    if name not in STYLES:
+    if not isinstance(name, str) or name not in STYLES:
         raise ValueError(f"style must be one of {', '.join(STYLES)}, or a Maze, Rooms or Warehouse, got {style!r}")
     return name
 
@@ -169,22 +182,18 @@ def _check_parts(parts: Maze | Rooms | Warehouse) -> None:
     for name, size in asdict(parts).items():
         if name == "loops":
             continue
-        if not isinstance(size, int | np.integer):
-            raise TypeError(f"the {name} of {type(parts).__name__} must be an integer, got {size!r}")
-        if not 1 <= size <= 9999:
+        if not 1 <= arguments.integer(size, f"the {name} of {type(parts).__name__}") <= 9999:
             raise ValueError(f"the {name} of {type(parts).__name__} must lie in 1..9999, got {size}")
 
 
 def _one_seed(seed: int | None) -> int:
     if seed is None:
         return int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
-    if not 0 <= seed < 2**64:
-        raise ValueError(f"seed must not be negative and fit into 64 bits, got {seed}")
-    return seed
+    return arguments.seed(seed)
 
 
 def _as_seeds(seeds: npt.ArrayLike) -> Seeds:
-    array = np.asarray(seeds)
-    if array.ndim != 1 or not (np.issubdtype(array.dtype, np.integer) and (array >= 0).all()):
-        raise ValueError(f"seeds must be a vector of non-negative integers, got {array.dtype} of shape {array.shape}")
+    array = arguments.shaped(seeds, "seeds", "(B,)", ": a vector of non-negative integers")
+    if array.dtype.kind not in "iu" or (array < 0).any():
+        raise ValueError(f"seeds must be a vector of non-negative integers below 2**64, got {array.dtype} {array}")
     return np.ascontiguousarray(array, dtype=np.uint64)

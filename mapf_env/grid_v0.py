@@ -5,8 +5,7 @@ from __future__ import annotations
 import copy
 import sys
 import time
-from operator import index
-from typing import Any, Literal, SupportsIndex
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +13,7 @@ import pettingzoo
 from gymnasium import spaces
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from mapf_env import _native
+from mapf_env import _native, arguments, rules
 from mapf_env.batched_env import BatchedEnv
 from mapf_env.config import EnvConfig
 from mapf_env.instance import Instance
@@ -58,10 +57,11 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         render_mode: Literal["ansi", "rgb_array", "human"] | None = None,
         **settings: Any,
     ) -> None:
-        if observation not in ("dict", "box"):
-            raise ValueError(f"observation must be dict or box, got {observation!r}")
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode must be ansi, rgb_array, human or None, got {render_mode!r}")
+        arguments.choice(observation, ("dict", "box"), "observation")
+        arguments.flag(preferences, "preferences")
+        arguments.flag(reuse_buffers, "reuse_buffers")
+        if render_mode is not None:
+            arguments.choice(render_mode, self.metadata["render_modes"], "render_mode")
         self._batch = BatchedEnv(1, **settings)
         self.config = config = self._batch.config
         if preferences and config.shield != "pibt":
@@ -88,12 +88,20 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         return self.__dict__ | {"_reused": None}  # its dictionaries share the memory of its arrays
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The space of an agent's observation; the same object at every call."""
-        return self.observation_spaces[agent]
+        """The space of an agent's observation; the same object at every call.
+
+        Raises:
+            ValueError: If there is no such agent.
+        """
+        return _space_of(agent, self.observation_spaces)
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The five moves: up, left, down, right, idle."""
-        return self.action_spaces[agent]
+        """The five moves: up, left, down, right, idle; with preferences a value for each.
+
+        Raises:
+            ValueError: If there is no such agent.
+        """
+        return _space_of(agent, self.action_spaces)
 
     @property
     def grid(self) -> npt.NDArray[np.bool_]:
@@ -138,11 +146,9 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
 
         Raises:
             ValueError: If the instance does not fit the environment.
-            TypeError: If `options["instance"]` is no `Instance`.
+            TypeError: If the seed is no integer, `options` no dictionary or `options["instance"]` no `Instance`.
         """
-        instance = (options or {}).get("instance")
-        if instance is not None and not isinstance(instance, Instance):
-            raise TypeError(f'options["instance"] must be a mapf_env.Instance, got {type(instance).__name__}')
+        seed, instance = None if seed is None else arguments.seed(seed), instance_asked_for(options)
         if self._reuse and self._reused is None:
             self._reused = _Reused(self)
         reused = self._reused
@@ -187,8 +193,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         if not self._preferences:
             ended = stepper.step_agents(actions, memory, agents, rewards, terminated, truncated, infos)
         if ended is None:
-            wanted = np.array([self._checked(actions)], np.float32 if self._preferences else np.int64)
-            batch.advance(wanted, buffers)
+            batch.advance(np.array([self._checked(actions)]), buffers)
             ended = stepper.outcome_by_agent(memory, agents, rewards, terminated, truncated, infos)
         if ended:
             self.agents = []
@@ -243,11 +248,8 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
             missing, unknown = set(self.agents) - actions.keys(), actions.keys() - set(self.agents)
             raise ValueError(f"give one action for each agent; missing: {sorted(missing)}, unknown: {sorted(unknown)}")
         if not self._preferences:
-            return [_as_action(agent, actions[agent]) for agent in self.agents]
-        for agent in self.agents:
-            if np.shape(actions[agent]) != (5,):
-                raise ValueError(f"the action of {agent} must be a value for each of the five moves")
-        return [actions[agent] for agent in self.agents]
+            return [arguments.integer(actions[agent], f"the action of {agent}") for agent in self.agents]
+        return [_as_preferences(agent, actions[agent]) for agent in self.agents]
 
 
 class _Reused:
@@ -271,11 +273,24 @@ def fov_space(config: EnvConfig) -> spaces.Box:
     return spaces.Box(bounds[0], bounds[1], shape, dtype)
 
 
-def _as_action(agent: str, action: SupportsIndex) -> int:
+def instance_asked_for(options: dict[str, Any] | None) -> Instance | None:
+    """`options["instance"]` of a reset, if it is there; raises TypeError where it, or `options`, is something else."""
+    instance = None if options is None else arguments.instance_of(options, dict, "options").get("instance")
+    return None if instance is None else arguments.instance_of(instance, Instance, 'options["instance"]')
+
+
+def _space_of(agent: str, found: dict[str, spaces.Space[Any]]) -> spaces.Space[Any]:
     try:
-        return index(action)
-    except TypeError:
-        raise TypeError(f"the action of {agent} must be an integer 0..4, got {action!r}") from None
+        return found[agent]
+    except (KeyError, TypeError):
+        raise ValueError(f"there is no agent {agent!r}: they are agent_0 to agent_{len(found) - 1}") from None
+
+
+def _as_preferences(agent: str, action: Any) -> npt.NDArray[np.float32]:
+    values = arguments.array(action, f"the action of {agent}")
+    if values.shape != (5,):
+        raise ValueError(f"the action of {agent} must be a value for each of the five moves, got {action!r}")
+    return rules.as_values(values)
 
 
 def parallel_env(**settings: Any) -> GridEnv:

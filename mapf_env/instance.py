@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mapf_env import _native
+from mapf_env import _native, arguments
 
 Cells = npt.NDArray[np.int32]
 Obstacles = npt.NDArray[np.bool_]
@@ -34,34 +34,31 @@ class Instance:
     grid: Obstacles
     starts: Cells
     goals: Cells
-    _components: npt.NDArray[np.int32] = field(init=False)
+    _regions: npt.NDArray[np.int32] = field(init=False)
 
     def __init__(self, grid: npt.ArrayLike, starts: npt.ArrayLike, goals: npt.ArrayLike) -> None:
         obstacles = as_obstacles(grid)
-        self._set(obstacles, _native.components(obstacles), starts, goals)
+        self._set(obstacles, _native.regions(obstacles), _team(starts, "starts"), _team(goals, "goals"))
 
-    def _set(
-        self, grid: Obstacles, components: npt.NDArray[np.int32], starts: npt.ArrayLike, goals: npt.ArrayLike
-    ) -> None:
-        start_cells, goal_cells = _as_cells(starts, "starts"), _as_cells(goals, "goals")
-        if start_cells.shape != goal_cells.shape:
-            raise ValueError(f"{len(start_cells)} starts but {len(goal_cells)} goals: give one goal for each robot")
-        _require_free(grid, start_cells, "start")
-        _require_free(grid, goal_cells, "goal")
-        _require_distinct(start_cells, "start")
-        _require_distinct(goal_cells, "goal")
-        cut_off = np.flatnonzero(components[tuple(start_cells.T)] != components[tuple(goal_cells.T)])
+    def _set(self, grid: Obstacles, regions: npt.NDArray[np.int32], starts: Cells, goals: Cells) -> None:
+        if starts.shape != goals.shape:
+            raise ValueError(f"{len(starts)} starts but {len(goals)} goals: give one goal for each robot")
+        _require_free(grid, starts, "start")
+        _require_free(grid, goals, "goal")
+        _require_distinct(starts, "start")
+        _require_distinct(goals, "goal")
+        cut_off = np.flatnonzero(regions[tuple(starts.T)] != regions[tuple(goals.T)])
         if len(cut_off):
             robot = cut_off[0]
             raise ValueError(
-                f"agent {robot} cannot reach its goal {_cell(goal_cells[robot])} from {_cell(start_cells[robot])}: "
+                f"agent {robot} cannot reach its goal {_cell(goals[robot])} from {_cell(starts[robot])}: "
                 "obstacles separate them; move one of the two or open the map"
             )
         for name, value in (
             ("grid", grid),
-            ("starts", start_cells),
-            ("goals", goal_cells),
-            ("_components", components),
+            ("starts", starts),
+            ("goals", goals),
+            ("_regions", regions),
         ):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -78,7 +75,7 @@ class Instance:
             ValueError: If the positions are not distinct free cells from which the goals can be reached.
         """
         seen_from_here = object.__new__(Instance)
-        seen_from_here._set(self.grid, self._components, positions, self.goals)
+        seen_from_here._set(self.grid, self._regions, _team(positions, "positions"), self.goals)
         return seen_from_here
 
     def __eq__(self, other: object) -> bool:
@@ -103,27 +100,23 @@ class Instance:
 
 def as_obstacles(grid: npt.ArrayLike) -> Obstacles:
     """A contiguous copy of `grid` as (H, W) bool; raises TypeError or ValueError where it is no map."""
-    array = np.asarray(grid)
-    if array.ndim != 2 or 0 in array.shape:
-        raise ValueError(f"grid must have shape (H, W) with at least one cell, got {array.shape}")
+    return as_bool(arguments.shaped(grid, "grid", "(H, W)", " with at least one cell", filled=True), "grid")
+
+
+def as_bool(array: npt.NDArray[Any], name: str) -> Obstacles:
+    """A contiguous copy of maps as bool; raises TypeError or ValueError where cells are neither free nor obstacles."""
     if array.dtype != np.bool_:
-        if not np.issubdtype(array.dtype, np.integer):
-            raise TypeError(f"grid must be bool (True is an obstacle) or integers 0 and 1, got dtype {array.dtype}")
-        if array.min() < 0 or array.max() > 1:
-            raise ValueError(f"grid must hold 0 (free) and 1 (obstacle) only, got values {array.min()}..{array.max()}")
+        if array.dtype.kind not in "iu":
+            raise TypeError(f"{name} must be bool (True is an obstacle) or integers 0 and 1, got dtype {array.dtype}")
+        if array.size and (array.min() < 0 or array.max() > 1):
+            raise ValueError(
+                f"{name} must hold 0 (free) and 1 (obstacle) only, got values {array.min()}..{array.max()}"
+            )
     return np.array(array, dtype=np.bool_, order="C")
 
 
-def _as_cells(cells: npt.ArrayLike, name: str) -> Cells:
-    array = np.asarray(cells)
-    if array.ndim != 2 or array.shape[1] != 2 or len(array) == 0:
-        raise ValueError(
-            f"{name} must have shape (N, 2): a row and a column for each of N >= 1 agents, got {array.shape}"
-        )
-    if not np.issubdtype(array.dtype, np.integer):
-        raise TypeError(f"{name} must be integers, got dtype {array.dtype}")
-    limits = np.iinfo(np.int32)
-    return np.array(np.clip(array, limits.min, limits.max), dtype=np.int32, order="C")
+def _team(cells: npt.ArrayLike, name: str) -> Cells:
+    return arguments.cells(cells, name, "(N, 2)", ": a row and a column for each of N >= 1 agents", filled=True)
 
 
 def _require_free(grid: Obstacles, cells: Cells, name: str) -> None:

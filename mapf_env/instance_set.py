@@ -11,12 +11,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mapf_env.files import PathLike, write_whole
+from mapf_env import arguments
+from mapf_env.files import PathLike, as_path, write_whole
 from mapf_env.instance import Instance, Obstacles
 
 _FORMAT = "mapf-instances"
@@ -24,7 +24,12 @@ _FIELDS = ("map", "starts", "goals", "sha256")
 
 
 def instance_hash(instance: Instance) -> str:
-    """The SHA-256 of an instance, in hexadecimal digits; equal problems have equal hashes on every machine."""
+    """The SHA-256 of an instance, in hexadecimal digits; equal problems have equal hashes on every machine.
+
+    Raises:
+        TypeError: If it is no instance.
+    """
+    arguments.instance_of(instance, Instance, "instance")
     height, width = instance.grid.shape
     lines = [f"{height} {width} {instance.num_agents}", *_rows(instance.grid)]
     ends = np.concatenate([instance.starts, instance.goals], axis=1).tolist()
@@ -36,6 +41,7 @@ def save_instances(path: PathLike, instances: Sequence[Instance]) -> None:
     """Write the instances to one file, as a whole or not at all; a map that several share is written once.
 
     Raises:
+        TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written; an existing one is then unchanged.
     """
     maps: dict[tuple[str, ...], int] = {}
@@ -46,7 +52,7 @@ def save_instances(path: PathLike, instances: Sequence[Instance]) -> None:
             "goals": instance.goals.tolist(),
             "sha256": instance_hash(instance),
         }
-        for instance in instances
+        for instance in arguments.each_of(instances, Instance, "instances")
     ]
     head = json.dumps({"format": _FORMAT, "version": 1, "maps": list(maps)})
     lines = ",\n".join(json.dumps(entry, separators=(",", ":")) for entry in entries)
@@ -61,7 +67,7 @@ def load_instances(path: PathLike) -> list[Instance]:
         OSError: If the file cannot be read.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(as_path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no set of instances: {error}") from None
     if not isinstance(content, dict) or content.get("format") != _FORMAT or content.get("version") != 1:

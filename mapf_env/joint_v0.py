@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from mapf_env import arguments
 from mapf_env.batched_env import BatchedEnv, Observation
-from mapf_env.grid_v0 import fov_space
-from mapf_env.instance import Instance
+from mapf_env.grid_v0 import fov_space, instance_asked_for
 
 
 class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
@@ -41,17 +41,27 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Begin an episode: a fresh random instance, or `options["instance"]`; seeds are those of `BatchedEnv`."""
+        """Begin an episode: a fresh random instance, or `options["instance"]`; seeds are those of `BatchedEnv`.
+
+        Raises:
+            ValueError: If the instance does not fit the environment.
+            TypeError: If the seed is no integer, `options` no dictionary or `options["instance"]` no `Instance`.
+        """
+        seed, instance = None if seed is None else arguments.seed(seed), instance_asked_for(options)
         super().reset(seed=seed)
-        instance: Instance | None = (options or {}).get("instance")
         observation = self._batch.reset(seed, instances=None if instance is None else [instance])
         return self._seen(observation), self._infos(np.zeros(self._batch.num_agents, np.bool_))
 
     def step(
         self, action: npt.NDArray[np.integer]
     ) -> tuple[dict[str, npt.NDArray[Any]], float, bool, bool, dict[str, Any]]:
-        """Execute the joint action (N,)."""
-        step = self._batch.step(np.asarray(action)[None])
+        """Execute the joint action (N,).
+
+        Raises:
+            ValueError: If the shape is wrong or an action is out of range.
+            TypeError: If the actions are not integers.
+        """
+        step = self._batch.step(arguments.shaped(action, "action", "(N,)")[None])
         reward, terminated, truncated = step.rewards[0].sum(), step.terminated[0], step.truncated[0]
         infos = self._infos(step.replaced[0])
         return self._seen(step.observation), float(reward), bool(terminated), bool(truncated), infos

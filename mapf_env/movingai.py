@@ -6,7 +6,6 @@ The format counts columns x and rows y; this module turns them into (row, col) a
 from __future__ import annotations
 
 import math
-import operator
 import os
 import re
 from pathlib import Path, PurePosixPath
@@ -15,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mapf_env import _native
-from mapf_env.files import PathLike, write_whole
+from mapf_env import _native, arguments
+from mapf_env.files import PathLike, as_path, write_whole
 from mapf_env.instance import Instance, Obstacles, as_obstacles
 
 FREE = ".GS"
@@ -88,13 +87,9 @@ def load_scen(path: PathLike, num_agents: int | None = None, map_path: PathLike 
     if not lines or not re.fullmatch(r"version\s+1(\.0)?", lines[0].strip()):
         raise ValueError(f"{path}, line 1: expected 'version 1', got {_shown(lines, 1)}; is this a MovingAI scenario?")
     available = len(lines) - 1
-    count = available if num_agents is None else operator.index(num_agents)
+    count = available if num_agents is None else arguments.integer(num_agents, "num_agents", 1)
     if count < 1:
-        raise ValueError(
-            f"{path}, line 1: no entries follow; give another file"
-            if num_agents is None
-            else f"num_agents must be at least 1, got {num_agents}"
-        )
+        raise ValueError(f"{path}, line 1: no entries follow; give another file")
     if count > available:
         raise ValueError(
             f"{path}, line {len(lines)}: {count} agents asked for, but only {available} entries; ask for fewer"
@@ -106,7 +101,7 @@ def load_scen(path: PathLike, num_agents: int | None = None, map_path: PathLike 
                 f"{path}, line {number}: the map is {entry.map_name!r}, but line 2 says {entries[0].map_name!r}; "
                 "all agents of an instance share one map"
             )
-    chosen_map = _beside(path, entries[0].map_name) if map_path is None else Path(map_path)
+    chosen_map = _beside(path, entries[0].map_name) if map_path is None else as_path(map_path, "map_path")
     grid = load_map(chosen_map)
     for number, entry in enumerate(entries, start=2):
         if entry.size != grid.shape:
@@ -145,13 +140,14 @@ def save_scen(path: PathLike, instance: Instance, map_path: PathLike) -> None:
         ValueError: If the file at `map_path` holds another map than the instance's, or its name fits no scenario.
         OSError: If the map cannot be read or the scenario not written; an existing one is then unchanged.
     """
-    if not Path(map_path).is_file():
+    arguments.instance_of(instance, Instance, "instance")
+    if not as_path(map_path, "map_path").is_file():
         raise FileNotFoundError(f"no map at {map_path}: write it first, with save_map(map_path, instance.grid)")
     if not np.array_equal(load_map(map_path), instance.grid):
         raise ValueError(
             f"{map_path} is not the instance's map; save the instance's grid under another name and give that"
         )
-    name = Path(os.path.relpath(map_path, Path(path).parent)).as_posix()
+    name = Path(os.path.relpath(map_path, as_path(path).parent)).as_posix()
     if re.search(r"[\t\r\n]", name):
         raise ValueError(
             f"the map's name {name!r} holds a tab or a line break, which a scenario cannot; rename the map"
@@ -167,7 +163,7 @@ def save_scen(path: PathLike, instance: Instance, map_path: PathLike) -> None:
 
 def _lines(path: PathLike) -> list[str]:
     """The lines of a text file without their ends, and without blank lines at the file's end."""
-    lines = Path(path).read_text(encoding="utf-8-sig", errors="replace").split("\n")
+    lines = as_path(path).read_text(encoding="utf-8-sig", errors="replace").split("\n")
     while lines and not lines[-1].strip():
         lines.pop()
     return lines

@@ -13,7 +13,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 import numpy.typing as npt
 
-from mapf_env import svg
+from mapf_env import arguments, svg
 from mapf_env.files import PathLike, write_whole
 from mapf_env.instance import Instance
 from mapf_env.solution import Solution
@@ -54,13 +54,14 @@ def animate(
 
     Raises:
         ValueError: If the paths are of another number of agents or leave the map, or a time is out of range.
+        TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written.
     """
     require_drawable(instance, solution)
-    if not (math.isfinite(step_seconds) and step_seconds > 0):
+    require_title(title)
+    if not (math.isfinite(arguments.number(step_seconds, "step_seconds")) and step_seconds > 0):
         raise ValueError(f"step_seconds must be a positive number, got {step_seconds}")
-    if pause_steps < 0:
-        raise ValueError(f"pause_steps must be at least 0, got {pause_steps}")
+    arguments.integer(pause_steps, "pause_steps", 0, arguments.MOST_INT)
     picture = _page(instance, title, _moving(instance, solution, step_seconds, pause_steps))
     if path is not None:
         write_whole(path, picture)
@@ -74,7 +75,9 @@ def draw(instance: Instance, solution: Solution | None = None) -> str:
 
     Raises:
         ValueError: If the paths are of another number of agents or leave the map.
+        TypeError: If an argument has the wrong type.
     """
+    arguments.instance_of(instance, Instance, "instance")
     colours = svg.colours(instance.num_agents)
     trails, rings, caption = [], [], []
     if solution is not None:
@@ -257,9 +260,16 @@ def _caption_line(instance: Instance) -> int:
     return instance.grid.shape[0] * _CELL + _FOOTER + 2
 
 
+def require_title(title: str | None) -> None:
+    """Raise TypeError if the title is no text."""
+    if title is not None:
+        arguments.instance_of(title, str, "title")
+
+
 def require_drawable(instance: Instance, solution: Solution) -> None:
-    """Raise ValueError if the paths are of another number of agents or leave the map."""
-    paths = solution.paths
+    """Raise ValueError if the paths are of another number of agents or leave the map, TypeError if there are none."""
+    arguments.instance_of(instance, Instance, "instance")
+    paths = arguments.instance_of(solution, Solution, "solution").paths
     if paths.shape[1] != instance.num_agents:
         raise ValueError(
             f"the solution has {paths.shape[1]} paths, the instance {instance.num_agents} agents; "

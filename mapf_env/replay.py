@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
-from mapf_env import svg
+from mapf_env import arguments, svg
 from mapf_env.config import EnvConfig
 from mapf_env.files import PathLike, write_whole
 from mapf_env.instance import Instance
-from mapf_env.render import require_drawable
+from mapf_env.render import require_drawable, require_title
 from mapf_env.solution import Solution
 
 
@@ -46,8 +46,11 @@ def replay(
 
     Raises:
         ValueError: If the paths are of another number of agents or leave the map.
+        TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written.
     """
+    require_drawable(instance, solution)
+    require_title(title)
     title = title or f"{instance.num_agents} robots, {len(solution.paths) - 1} steps"
     return replay_scenes([Scene("", instance, {"": solution})], path, title=title, config=config)
 
@@ -66,14 +69,16 @@ def replay_scenes(
     Raises:
         ValueError: If there is no scene, one has no solution, or its paths are of another number of agents or leave
             the map.
+        TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written.
     """
-    if not scenes:
+    shown = list(arguments.each_of(scenes, Scene, "scenes"))
+    if not shown:
         raise ValueError("there are no scenes to show; give at least one")
-    config = EnvConfig() if config is None else config
+    config = EnvConfig() if config is None else arguments.instance_of(config, EnvConfig, "config")
     content = {
-        "title": title,
-        "scenes": [_plain(scene) for scene in scenes],
+        "title": arguments.instance_of(title, str, "title"),
+        "scenes": [_plain(scene) for scene in shown],
         "fov_radius": config.fov_radius,
         "comm_radius": min(config.comm_radius, 1e9),
     }
@@ -86,9 +91,11 @@ def replay_scenes(
 
 
 def _plain(scene: Scene) -> dict[str, object]:
-    if not scene.solutions:
+    arguments.instance_of(scene.title, str, "the title of a scene")
+    if not arguments.instance_of(scene.solutions, Mapping, f"the solutions of the scene {scene.title!r}"):
         raise ValueError(f"the scene {scene.title!r} has no solution to show; give at least one")
-    for solution in scene.solutions.values():
+    for name, solution in scene.solutions.items():
+        arguments.instance_of(name, str, f"the name of a solution of the scene {scene.title!r}")
         require_drawable(scene.instance, solution)
     return {
         "title": scene.title,

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import asdict, dataclass
+
+from mapf_env import arguments
 
 
-class Rewards(NamedTuple):
-    """What a robot gets in a step; all parts that apply add up."""
+@dataclass(frozen=True, slots=True)
+class Rewards:
+    """What a robot gets in a step; all parts that apply add up.
+
+    Raises:
+        ValueError: If a part is infinite or not a number.
+        TypeError: If a part is none at all.
+    """
 
     on_goal: float = 0.0
     """It is on its goal after the step."""
@@ -20,6 +28,10 @@ class Rewards(NamedTuple):
     """All robots of the team are on their goals at once: the episode terminates."""
     closer: float = 0.0
     """For each step by which the shortest way to its goal has become shorter (negative if longer)."""
+
+    def __post_init__(self) -> None:
+        for name, part in asdict(self).items():
+            arguments.finite(part, f"the part {name} of Rewards")
 
 
 SCHEMES: dict[str, Rewards] = {

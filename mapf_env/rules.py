@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mapf_env import _native
+from mapf_env import _native, arguments
 from mapf_env.config import CHANNELS, Channel
 
 Positions = npt.NDArray[np.int32]
@@ -96,24 +96,25 @@ def communication_graph(
     """Who hears whom: weights (B, N, N), or (N, N) for positions (N, 2); `radius` is one number or one for each team.
 
     1, or with `weights="distance"` 1 / distance, where two different robots are closer than `radius` cells (Euclidean,
-    strictly, as in the released code), else 0.
+    strictly, as in the released code), else 0. `out` is memory (B, N, N) to write them into, for positions (B, N, 2).
     """
-    radii = np.asarray(radius, np.float64)
+    arguments.choice(weights, ("binary", "distance"), "weights")
+    found = arguments.array(positions, "positions")
+    single = found.ndim == 2
+    cells = arguments.cells(found[None] if single else found, "positions", "(B, N, 2)", " or (N, 2)")
+    radii = arguments.array(radius, "radius")
+    if radii.dtype.kind not in "fiu":
+        raise TypeError(f"radius must be a number, got {radius!r}")
+    if radii.shape not in ((), (1,), (len(cells),)):
+        raise ValueError(f"radius must be one number or one for each of {len(cells)} teams, got shape {radii.shape}")
     if not (radii >= 0).all():
         raise ValueError(f"the communication radius must not be negative, got {radius}")
-    if weights not in ("binary", "distance"):
-        raise ValueError(f"weights must be binary or distance, got {weights!r}")
-    cells = np.asarray(positions)
-    if cells.ndim not in (2, 3) or cells.shape[-1] != 2:
-        raise ValueError(f"positions must have shape (N, 2) or (B, N, 2), got {cells.shape}")
-    if cells.dtype.kind not in "iu":
-        raise TypeError(f"positions must be integers, got dtype {cells.dtype}")
-    if cells.ndim == 2:
-        return communication_graph(cells[None], radius, weights=weights)[0]
     if out is None:
         out = np.empty((*cells.shape[:2], cells.shape[1]), np.float32)
-    _native.communication_graph(cells, np.full(len(cells), radii), weights == "distance", out)
-    return out
+    elif single or not isinstance(out, np.ndarray) or out.dtype != np.float32:
+        raise TypeError("out must be a float32 array (B, N, N), for positions (B, N, 2)")
+    _native.communication_graph(cells, np.full(len(cells), radii, np.float64), weights == "distance", out)
+    return out[0] if single else out
 
 
 def connecting_radius(positions: npt.NDArray[np.int32], radius: float) -> float:
@@ -152,7 +153,20 @@ class Edges(NamedTuple):
 
 
 def communication_edges(graph: npt.NDArray[np.float32], positions: Positions) -> Edges:
-    """The edges of dense graphs (B, N, N) between robots at `positions` (B, N, 2)."""
+    """The edges of dense graphs (B, N, N) between robots at `positions` (B, N, 2).
+
+    Raises:
+        ValueError: If the shapes do not fit.
+        TypeError: If positions are no integers or weights no numbers.
+    """
+    graph, positions = (
+        arguments.shaped(graph, "graph", "(B, N, N)"),
+        arguments.cells(positions, "positions", "(B, N, 2)"),
+    )
+    if graph.shape != (*positions.shape[:2], positions.shape[1]):
+        raise ValueError(f"the graph {graph.shape} and the positions {positions.shape} are not of the same robots")
+    if graph.dtype.kind not in "fiub":
+        raise TypeError(f"graph must hold weights, got dtype {graph.dtype}")
     team, receiver, sender = np.nonzero(graph)
     offset = positions[team, sender] - positions[team, receiver]
     return Edges(team, receiver, sender, graph[team, receiver, sender], offset)

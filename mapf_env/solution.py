@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from mapf_env import arguments
 from mapf_env.instance import Instance
 
 
@@ -57,16 +58,7 @@ class Solution:
     paths: npt.NDArray[np.int32]
 
     def __post_init__(self) -> None:
-        array = np.asarray(self.paths)
-        if array.ndim != 3 or array.shape[2] != 2 or 0 in array.shape:
-            raise ValueError(f"paths must have shape (T + 1, N, 2), got {array.shape}")
-        if array.dtype.kind not in "iu":
-            raise TypeError(f"paths must be integers, got dtype {array.dtype}")
-        if array.dtype == np.int32:
-            array = np.array(array, order="C")
-        else:
-            limits = np.iinfo(np.int32)
-            array = np.array(np.clip(array, limits.min, limits.max), dtype=np.int32, order="C")
+        array = arguments.cells(self.paths, "paths", "(T + 1, N, 2)", filled=True)
         array.flags.writeable = False
         object.__setattr__(self, "paths", array)
 
@@ -130,7 +122,12 @@ class Solution:
         return found
 
     def violations(self, instance: Instance) -> list[str]:
-        """All that keeps these paths from solving `instance`, in words; empty if they solve it."""
+        """All that keeps these paths from solving `instance`, in words; empty if they solve it.
+
+        Raises:
+            TypeError: If `instance` is none.
+        """
+        arguments.instance_of(instance, Instance, "instance")
         if self.paths.shape[1] != instance.num_agents:
             return [f"{self.paths.shape[1]} paths for {instance.num_agents} agents"]
         found = []

@@ -29,5 +29,6 @@ def test_a_failure_is_of_its_kind(name: str) -> None:
 
 def test_every_drawing_is_shown() -> None:
     concepts = (HOME.parent / "concepts.md").read_text(encoding="utf-8")
-    for path in HOME.glob("*.svg"):
-        assert f"](drawings/{path.name})" in concepts
+    drawings = {path.name for path in HOME.glob("*.svg")}
+    assert drawings
+    assert drawings == {name for name in drawings if f"](drawings/{name})" in concepts}

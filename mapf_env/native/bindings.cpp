@@ -9,6 +9,7 @@
 #include <tuple>
 
 #include "mapf_env/native/arrays.hpp"
+#include "mapf_env/native/checks.hpp"
 #include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/generate.hpp"
 #include "mapf_env/native/goals.hpp"
@@ -25,17 +26,14 @@ using namespace nb::literals;
 
 namespace {
 
+using mapf::fail;
 using mapf::In;
 using mapf::InOut;
 using mapf::Layout;
 using mapf::make_array;
 using mapf::Out;
-
-[[noreturn]] void fail(const std::string& message) { throw nb::value_error(message.c_str()); }
-
-void require(bool holds, const char* message) {
-    if (!holds) fail(message);
-}
+using mapf::require;
+using mapf::shown;
 
 mapf::Grid to_grid(const In<bool, 2>& grid) {
     return {reinterpret_cast<const std::uint8_t*>(grid.data()), static_cast<int>(grid.shape(0)),
@@ -67,9 +65,12 @@ void require_on_map(const Cells& cells, const Layout& layout, std::size_t num_en
                  std::to_string(cell[1]) + "), lies outside the map");
 }
 
-Out<std::int32_t> components(In<bool, 2> grid) {
-    auto [labels, out] = make_array<std::int32_t>({grid.shape(0), grid.shape(1)});
-    mapf::label_components(to_grid(grid), labels);
+Out<std::int32_t> regions(In<bool, 2> grid) {
+    const auto map = to_grid(grid);
+    const auto found = mapf::regions_of(map);
+    auto [region, out] = make_array<std::int32_t>({grid.shape(0), grid.shape(1)});
+    for (int row = 0; row < map.layout.height; ++row, region += map.layout.width)
+        std::copy_n(found.data() + map.layout.cell(row, 0), map.layout.width, region);
     return out;
 }
 
@@ -168,14 +169,10 @@ Out<std::int8_t> shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positio
     const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1);
     require_on_map(positions, layout, num_envs, "positions");
     if (actions.shape(0) != num_envs || actions.shape(1) != num_agents)
-        fail("actions must have shape (" + std::to_string(num_envs) + ", " + std::to_string(num_agents) + "), got (" +
-             std::to_string(actions.shape(0)) + ", " + std::to_string(actions.shape(1)) + ")");
+        fail("actions must have shape " + shown({num_envs, num_agents}) + ", got " +
+             shown({actions.shape(0), actions.shape(1)}));
     require(seeds.shape(0) == num_envs && times.shape(0) == num_envs, "give one seed and time for each environment");
-    for (std::size_t i = 0; i < num_envs * num_agents; ++i)
-        if (actions.data()[i] < 0 || actions.data()[i] >= mapf::num_actions)
-            fail("action " + std::to_string(actions.data()[i]) + " of agent " + std::to_string(i % num_agents) +
-                 " in environment " + std::to_string(i / num_agents) +
-                 " is none of 0..4 (up, left, down, right, idle)");
+    mapf::require_actions(actions.data(), num_envs, num_agents);
     auto [executed, out] = make_array<std::int8_t>({num_envs, num_agents});
     nb::gil_scoped_release release;
     mapf::ShieldScratch scratch(layout, static_cast<int>(num_agents));
@@ -309,9 +306,7 @@ Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> po
     require(!by_values || values.shape(2) == mapf::num_actions, "values of actions must have shape (B, N, 5)");
     for (std::size_t i = 0; i < values.size(); ++i)
         require(!std::isnan(values.data()[i]), "the values of actions must be numbers");
-    for (std::size_t i = 0; !by_values && i < actions.size(); ++i)
-        require(actions.data()[i] >= 0 && actions.data()[i] < mapf::num_actions,
-                "actions must be 0..4 (up, left, down, right, idle)");
+    if (!by_values) mapf::require_actions(actions.data(), num_envs, num_agents);
     require(under_way.shape(0) == num_envs && under_way.shape(1) == num_agents, "under_way must have shape (B, N)");
     require(seeds.shape(0) == num_envs && times.shape(0) == num_envs, "give one seed and time for each environment");
     auto [executed, out] = make_array<std::int8_t>({num_envs, num_agents});
@@ -348,15 +343,12 @@ void draw_goals(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, InOu
     require(seeds.shape(0) == num_envs, "give one seed for each environment");
     std::vector<std::uint8_t> taken(size, 0);
     for (std::size_t b = 0; b < num_envs; ++b) {
-        std::vector<std::int32_t> inner(static_cast<std::size_t>(layout.height) * layout.width), label(size, -1);
-        mapf::label_components(mapf::grid_of(layout, obstacles.data() + b * size), inner.data());
-        for (int row = 0; row < layout.height; ++row)
-            std::copy_n(inner.data() + row * layout.width, layout.width, label.data() + layout.cell(row, 0));
+        const auto regions = mapf::regions_of(mapf::grid_of(layout, obstacles.data() + b * size));
         auto* team = goals.data() + b * num_agents * 2;
         mapf::mark(layout, team, static_cast<int>(num_agents), std::uint8_t{1}, taken.data());
         for (std::size_t i = 0; i < num_agents; ++i)
             if (arrived(b, i))
-                mapf::draw_goal(layout, label.data(), positions.data() + (b * num_agents + i) * 2,
+                mapf::draw_goal(layout, regions.data(), positions.data() + (b * num_agents + i) * 2,
                                 mapf::goal_random(seeds(b), static_cast<int>(i), arrivals(b, i)), taken.data(),
                                 team + 2 * i);
         mapf::mark(layout, team, static_cast<int>(num_agents), std::uint8_t{0}, taken.data());
@@ -387,8 +379,7 @@ void define_for_dtype(nb::module_& m) {
 
 NB_MODULE(_native, m) {
     m.doc() = "Native kernels of the world: distances, maps, shield, views and communication graphs, over batches.";
-    m.def("components", &components, "grid"_a,
-          "(H, W) int32 label of the connected free region of each cell; -1 on obstacles.");
+    m.def("regions", &regions, "grid"_a, "(H, W) int32 number of the region of each cell; -1 on obstacles.");
     m.def("distances", &distances, "grid"_a, "cells"_a,
           "(M, H, W) int32 steps from each cell to each of M free cells (M, 2); -1 where there is no way.");
     const mapf::Parts parts;

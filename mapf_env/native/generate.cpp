@@ -249,15 +249,15 @@ Grid random_map(Style style, const Parts& parts, int height, int width, int obst
 
 void place_agents(const Grid& grid, int num_agents, Random& random, std::int32_t* starts, std::int32_t* goals) {
     const auto& layout = grid.layout;
-    std::vector<std::int32_t> label(static_cast<std::size_t>(layout.height) * layout.width);
-    label_components(grid, label.data());
-    std::vector<int> region_size(label.size(), 0);
-    for (const auto region : label)
+    const auto regions = regions_of(grid);
+    std::vector<int> region_size(regions.size(), 0);
+    for (const auto region : regions)
         if (region >= 0) ++region_size[region];
     const auto largest = std::max_element(region_size.begin(), region_size.end()) - region_size.begin();
     std::vector<int> cells;
-    for (std::size_t i = 0; i < label.size(); ++i)
-        if (label[i] == largest) cells.push_back(static_cast<int>(i));
+    for (int row = 0; row < layout.height; ++row)
+        for (int col = 0; col < layout.width; ++col)
+            if (regions[layout.cell(row, col)] == largest) cells.push_back(row * layout.width + col);
     if (static_cast<int>(cells.size()) < std::max(num_agents, 2))
         throw std::invalid_argument("the largest connected free region has " + std::to_string(cells.size()) +
                                     " cells, too few for " + std::to_string(num_agents) +

@@ -48,33 +48,32 @@ struct Grid {
     }
 };
 
-// Numbers the connected free regions 0, 1, ... in `labels` (height * width, row-major); obstacles are -1.
-inline void label_components(const Grid& grid, std::int32_t* labels) {
+// The region of each cell (layout.size()), numbered 0, 1, ... row by row; -1 on obstacles and the border.
+inline std::vector<std::int32_t> regions_of(const Grid& grid) {
     const auto& layout = grid.layout;
     const auto steps = layout.steps();
-    std::vector<std::int32_t> label(grid.blocked.size(), -1);
+    std::vector<std::int32_t> region(grid.blocked.size(), -1);
     std::vector<int> stack;
-    std::int32_t regions = 0;
+    std::int32_t count = 0;
     for (int row = 0; row < layout.height; ++row)
         for (int col = 0; col < layout.width; ++col) {
             const int cell = layout.cell(row, col);
-            if (!grid.blocked[cell] && label[cell] < 0) {
-                label[cell] = regions;
-                stack.push_back(cell);
-                while (!stack.empty()) {
-                    const int here = stack.back();
-                    stack.pop_back();
-                    for (int action = 0; action < idle; ++action) {
-                        const int neighbour = here + steps[action];
-                        if (grid.blocked[neighbour] || label[neighbour] >= 0) continue;
-                        label[neighbour] = regions;
-                        stack.push_back(neighbour);
-                    }
+            if (grid.blocked[cell] || region[cell] >= 0) continue;
+            region[cell] = count;
+            stack.push_back(cell);
+            while (!stack.empty()) {
+                const int here = stack.back();
+                stack.pop_back();
+                for (int action = 0; action < idle; ++action) {
+                    const int neighbour = here + steps[action];
+                    if (grid.blocked[neighbour] || region[neighbour] >= 0) continue;
+                    region[neighbour] = count;
+                    stack.push_back(neighbour);
                 }
-                ++regions;
             }
-            *labels++ = label[cell];
+            ++count;
         }
+    return region;
 }
 
 }  // namespace mapf

@@ -16,6 +16,8 @@
 #include <vector>
 
 #include "mapf_env/native/arrays.hpp"
+#include "mapf_env/native/by_agent.hpp"
+#include "mapf_env/native/checks.hpp"
 #include "mapf_env/native/pool.hpp"
 #include "mapf_env/native/team_step.hpp"
 
@@ -26,70 +28,12 @@ namespace mapf {
 
 namespace {
 
-[[noreturn]] void fail(const std::string& message) { throw nb::value_error(message.c_str()); }
-
-std::string shown(std::initializer_list<std::size_t> shape) {
-    std::string text;
-    for (const auto extent : shape) text += (text.empty() ? "(" : ", ") + std::to_string(extent);
-    return text + ")";
-}
-
 int process() {
 #ifdef _WIN32
     return 0;
 #else
     return static_cast<int>(getpid());
 #endif
-}
-
-// row[name] = value.
-void set(PyObject* row, PyObject* name, PyObject* value) {
-    if (value == nullptr || PyDict_SetItem(row, name, value) != 0) throw nb::python_error();
-}
-
-nb::object name(const char* text) { return nb::steal(PyUnicode_InternFromString(text)); }
-
-// A new reference to sequence[i].
-nb::object item(PyObject* sequence, Py_ssize_t i) {
-    nb::object value = nb::steal(PySequence_GetItem(sequence, i));
-    if (!value.is_valid()) throw nb::python_error();
-    return value;
-}
-
-// {agent: {name: column[i], ...}, ...} for the i-th agent, or {agent: column[i], ...} without names.
-nb::dict rows_by_agent(nb::list agents, nb::tuple names, nb::tuple columns) {
-    const std::size_t width = names.size();
-    if (columns.size() != std::max<std::size_t>(width, 1)) fail("give one column for each name");
-    nb::dict rows;
-    for (Py_ssize_t i = 0; i < PyList_Size(agents.ptr()); ++i) {
-        PyObject* agent = PyList_GetItem(agents.ptr(), i);
-        if (width == 0) {
-            set(rows.ptr(), agent, item(PyTuple_GetItem(columns.ptr(), 0), i).ptr());
-            continue;
-        }
-        const nb::dict row;
-        for (std::size_t k = 0; k < width; ++k)
-            set(row.ptr(), PyTuple_GetItem(names.ptr(), k), item(PyTuple_GetItem(columns.ptr(), k), i).ptr());
-        set(rows.ptr(), agent, row.ptr());
-    }
-    return rows;
-}
-
-// Reads actions[agent] of each agent, in order; false if the agents are not the same or an action is no whole number.
-bool read_actions(const nb::dict& actions, const nb::list& agents, std::vector<std::int64_t>& wanted) {
-    const std::size_t count = wanted.size();
-    if (actions.size() != count || agents.size() != count) return false;
-    for (std::size_t i = 0; i < count; ++i) {
-        PyObject* action = PyDict_GetItem(actions.ptr(), PyList_GetItem(agents.ptr(), static_cast<Py_ssize_t>(i)));
-        if (action == nullptr) return false;
-        const nb::object whole = PyLong_Check(action) ? nb::borrow(action) : nb::steal(PyNumber_Index(action));
-        wanted[i] = whole.is_valid() ? PyLong_AsLongLong(whole.ptr()) : -1;
-        if (wanted[i] == -1 && PyErr_Occurred()) {
-            PyErr_Clear();
-            return false;
-        }
-    }
-    return true;
 }
 
 // Where the observations of the only team of a batch go.
@@ -153,7 +97,7 @@ public:
         const std::size_t B = teams_.num_envs, N = teams_.num_agents;
         if (actions.shape(0) != B || actions.shape(1) != N)
             fail("actions must have shape " + shown({B, N}) + ", got " + shown({actions.shape(0), actions.shape(1)}));
-        require_actions(actions.data());
+        require_actions(actions.data(), B, N);
         run({actions.data(), nullptr}, fov, graph, skip_ended);
     }
 
@@ -217,7 +161,7 @@ public:
                                     nb::dict terminated, nb::dict truncated, nb::dict infos) {
         wanted_.resize(teams_.num_agents);
         if (teams_.num_envs != 1 || !read_actions(actions, agents, wanted_)) return std::nullopt;
-        require_actions(wanted_.data());
+        require_actions(wanted_.data(), 1, wanted_.size());
         require_masks(memory);
         run({wanted_.data(), nullptr}, memory.fov, memory.graph, false);
         return outcome_by_agent(memory, agents, rewards, terminated, truncated, infos);
@@ -285,18 +229,6 @@ private:
     void require_masks(const Memory<T>& memory) const {
         if (memory.masks.shape(0) != teams_.num_agents || memory.masks.shape(1) != num_actions)
             fail("the memory for masks must have shape " + shown({teams_.num_agents, num_actions}));
-    }
-
-    void require_actions(const std::int64_t* actions) const {  // of all robots, those that are not there too
-        const std::size_t robots = teams_.num_envs * teams_.num_agents;
-        const auto is_none = [](std::int64_t action) { return static_cast<std::uint64_t>(action) >= num_actions; };
-        bool any = false;
-        for (std::size_t i = 0; i < robots; ++i) any |= is_none(actions[i]);
-        if (!any) return;
-        const std::size_t i = std::find_if(actions, actions + robots, is_none) - actions;
-        fail("action " + std::to_string(actions[i]) + " of agent " + std::to_string(i % teams_.num_agents) +
-             " in environment " + std::to_string(i / teams_.num_agents) +
-             " is none of 0..4 (up, left, down, right, idle)");
     }
 
     void perceive_into(std::size_t b, TeamScratch<T>& scratch, T* fov, float* graph) {

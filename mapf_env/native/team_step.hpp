@@ -123,10 +123,8 @@ void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, st
         std::transform(grid + row * layout.width, grid + (row + 1) * layout.width, obstacles + layout.cell(row, 0),
                        [](bool blocked) { return static_cast<T>(blocked); });
     if (teams.regions != nullptr) {
-        std::vector<std::int32_t> inner(area);
-        label_components(grid_of(layout, obstacles), inner.data());
-        for (int row = 0; row < layout.height; ++row)
-            std::copy_n(inner.data() + row * layout.width, layout.width, teams.regions + b * size + layout.cell(row, 0));
+        const auto regions = regions_of(grid_of(layout, obstacles));
+        std::copy(regions.begin(), regions.end(), teams.regions + b * size);
     }
     if (teams.distances != nullptr)
         std::copy(begun.distances.begin(), begun.distances.end(), teams.distances + first * size);

@@ -207,8 +207,7 @@ def test_every_valid_plan_replays_exactly(instance: Instance, seed: int) -> None
     env = BatchedEnv(1, num_agents=instance.num_agents, height=max(height, 2), width=max(width, 2), density=0)
     grid = np.ones((max(height, 2), max(width, 2)), bool)
     grid[:height, :width] = instance.grid
-    far_goals = Instance(grid, instance.starts, instance.goals)
-    env.reset(instances=[far_goals])
+    env.reset(instances=[Instance(grid, instance.starts, instance.goals)])
     for time, actions in enumerate(solution.actions, start=1):
         step = env.step(actions[None])
         assert not step.replaced.any()

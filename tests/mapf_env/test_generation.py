@@ -161,8 +161,8 @@ def test_global_random_state_is_neither_read_nor_written() -> None:
         ({"density": 1.0}, r"density must lie in \[0, 1\), got 1.0"),
         ({"density": -0.1}, r"density must lie in \[0, 1\)"),
         ({"density": float("nan")}, r"density must lie in \[0, 1\)"),
-        ({"height": 0}, "height=0"),
-        ({"width": -3}, "width=-3"),
+        ({"height": 0}, "height must be at least 1, got 0"),
+        ({"width": -3}, "width must be at least 1, got -3"),
         ({"style": "cave"}, "style must be one of cells, .*, empty, or a Maze, Rooms or Warehouse, got 'cave'"),
         ({"num_agents": 0}, "num_agents must be at least 1, got 0"),
         ({"seed": -1}, "seed must .*-1"),
@@ -176,8 +176,11 @@ def test_bad_settings_are_refused(settings: dict[str, Any], message: str) -> Non
 
 
 def test_bad_seeds_are_refused() -> None:
-    for seeds in ([0.5], [[1]], [-1], 3):
-        with pytest.raises(ValueError, match="seeds must be a vector of non-negative integers"):
+    for seeds in ([0.5], [-1]):
+        with pytest.raises(ValueError, match=r"seeds must be a vector of non-negative integers below 2\*\*64, got"):
+            random_maps(seeds)
+    for seeds in ([[1]], 3):
+        with pytest.raises(ValueError, match=r"seeds must have shape \(B,\): a vector of non-negative integers, got"):
             random_maps(seeds)
     with pytest.raises(ValueError, match="give one seed for each grid"):
         random_cases([1, 2], np.zeros((3, 4, 4), bool), 2)

@@ -113,7 +113,7 @@ def test_rendering(capsys: pytest.CaptureFixture[str]) -> None:
     assert parallel_env(**size).render() is None
     with pytest.raises(ValueError, match="render_mode must be"):
         parallel_env(render_mode="hologram")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="observation must be dict or box"):
+    with pytest.raises(ValueError, match="observation must be one of dict, box, got"):
         parallel_env(observation="smell")  # pyright: ignore[reportArgumentType]
 
 

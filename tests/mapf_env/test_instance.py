@@ -121,10 +121,10 @@ def test_unreachable_positions_are_refused_by_at_as_well(instance: Instance) -> 
 
 
 @given(strategies.grids())
-def test_native_distances_and_components_agree_with_search_in_python(grid: oracles.Grid) -> None:
+def test_native_distances_and_regions_agree_with_search_in_python(grid: oracles.Grid) -> None:
     free = sorted(oracles.free_cells(grid))
     tables = _native.distances(grid, np.array(free, np.int32))
-    labels = _native.components(grid)
+    labels = _native.regions(grid)
     assert (labels == -1).tolist() == grid.tolist()
     assert labels.max() + 1 == len(oracles.regions(grid))
     for cell, table in zip(free, tables, strict=True):

@@ -446,6 +446,27 @@ def test_robots_that_are_not_there_earn_and_do_nothing_wherever_one_stood_before
     assert replaced > 0
 
 
+def test_who_was_there_before_a_step_is_whom_its_outcome_is_of_also_where_it_begins_the_next_episode() -> None:
+    cases = [random_instance(num_agents=n, height=5, width=5, seed=n) for n in (1, 3, 9)]
+    settings: dict[str, Any] = {"num_agents": 9, "height": 5, "width": 5, "max_cycles": 3, "fill": True}
+    wage = Rewards(on_goal=1.0, off_goal=1.0)
+    env = BatchedEnv(16, cases=cases, autoreset=AutoresetMode.SAME_STEP, reward=wage, **settings)
+    env.reset(seed=0)
+    generator, changed = np.random.default_rng(0), 0
+    for _ in range(12):
+        before = env.present
+        step = env.step(generator.integers(0, 5, (16, 9)))
+        assert np.array_equal(step.rewards == 1, before)
+        assert np.array_equal(step.observation.fov.any((2, 3, 4)), env.present)
+        assert np.array_equal(env.action_mask()[..., :4].any(-1) | env.present, env.present)
+        assert env.action_mask()[..., oracles.IDLE].all(), "there is always a choice"
+        if step.final_observation is not None:
+            ended = step.terminated | step.truncated
+            assert np.array_equal(step.final_observation.fov.any((2, 3, 4)), before[ended])
+        changed += int((env.present != before).any())
+    assert changed > 0
+
+
 def test_the_radius_grows_at_reset_until_the_robots_that_are_there_are_connected() -> None:
     cases = [random_instance(num_agents=n, height=9, width=9, seed=n) for n in (2, 3, 5, 8)]
     settings: dict[str, Any] = {"num_agents": 8, "height": 9, "width": 9, "comm_radius": 1.0, "fill": True}

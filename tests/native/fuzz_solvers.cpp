@@ -26,12 +26,11 @@ Crowd draw(mapf::Random& random) {
     for (auto& obstacle : obstacles) obstacle = random.below(10) < blocked;
     obstacles[0] = 0;
     mapf::Grid grid(obstacles.data(), height, width);
-    std::vector<std::int32_t> labels(obstacles.size());
-    mapf::label_components(grid, labels.data());
+    const auto regions = mapf::regions_of(grid);
     std::vector<int> free;
     for (int row = 0; row < height; ++row)
         for (int col = 0; col < width; ++col)
-            if (labels[static_cast<std::size_t>(row * width + col)] == 0) free.push_back(grid.layout.cell(row, col));
+            if (regions[grid.layout.cell(row, col)] == 0) free.push_back(grid.layout.cell(row, col));
     const int robots = 1 + random.below(std::min<int>(12, static_cast<int>(free.size())));
     random.shuffle_front(free, robots);
     std::vector<int> starts(free.begin(), free.begin() + robots);

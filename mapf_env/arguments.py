@@ -1,0 +1,146 @@
+"""The arguments of public calls, checked: each error says which one is wrong, what is allowed and what was given."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from numbers import Real
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+T = TypeVar("T")
+
+_INT32 = np.iinfo(np.int32)
+MOST_INT = int(_INT32.max)
+"""The native core counts robots, steps and a map's cells, its border included, in 32 bits."""
+MOST_THREADS = 1024
+
+
+def instance_of(value: object, kind: type[T], name: str) -> T:
+    """`value`, which must be a `kind`."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be a {_public_name(kind)}, got {type(value).__name__}")
+    return value
+
+
+def each_of(values: Iterable[T], kind: type[T], name: str) -> Iterator[T]:
+    """The values one by one, each of which must be a `kind`; that they can be gone through is checked at once."""
+    try:
+        iterator = iter(values)
+    except TypeError:
+        raise TypeError(f"{name} must be a sequence of {_public_name(kind)}, got {type(values).__name__}") from None
+    return (instance_of(value, kind, f"{name}[{index}]") for index, value in enumerate(iterator))
+
+
+def choice(value: object, known: Sequence[str], name: str) -> None:
+    """Raise ValueError unless `value` is one of the words `known`."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+
+
+def flag(value: object, name: str) -> bool:
+    """A bool, and nothing that is merely true or false."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
+def integer(value: object, name: str, least: int | None = None, most: int | None = None) -> int:
+    """An integer in least..most; True and False are none."""
+    found = _as_int(value, name)
+    if least is not None and found < least:
+        raise ValueError(f"{name} must be at least {least}, got {found}")
+    if most is not None and found > most:
+        raise ValueError(f"{name} must be at most {most}, got {found}")
+    return found
+
+
+def seed(value: object, name: str = "seed") -> int:
+    """An integer in 0..2**64 - 1."""
+    found = _as_int(value, name)
+    if not 0 <= found < 2**64:
+        raise ValueError(f"{name} must not be negative and fit into 64 bits, got {found}")
+    return found
+
+
+def number(value: object, name: str) -> float:
+    """A real number, which may be infinite or not a number; True and False are none."""
+    if type(value) is float:  # before the slow question
+        return value
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    return float(value)
+
+
+def finite(value: object, name: str) -> float:
+    """A number that is neither infinite nor none."""
+    found = number(value, name)
+    if not np.isfinite(found):
+        raise ValueError(f"{name} must be a finite number, got {found}")
+    return found
+
+
+def share(value: object, name: str) -> float:
+    """A number in [0, 1]."""
+    found = number(value, name)
+    if not 0.0 <= found <= 1.0:
+        raise ValueError(f"{name} must lie in [0, 1], got {found}")
+    return found
+
+
+def array(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
+    """`values` as an array."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{name} must be an array, but its rows differ in length: make them equally long") from None
+
+
+def shaped(
+    values: npt.ArrayLike, name: str, shape: str, meaning: str = "", *, filled: bool = False
+) -> npt.NDArray[Any]:
+    """`values` as an array of that shape, for example "(B, N, 2)", of which letters stand for any length.
+
+    `meaning` is what the message says after the shape; `filled`, that no axis may have length 0.
+    """
+    found, wanted = array(values, name), _axes(shape)
+    pairs = zip(wanted, found.shape, strict=False)
+    fits = all(length == asked if asked is not None else length or not filled for asked, length in pairs)
+    if found.ndim != len(wanted) or not fits:
+        raise ValueError(f"{name} must have shape {shape}{meaning}, got {found.shape}")
+    return found
+
+
+def cells(
+    values: npt.ArrayLike, name: str, shape: str, meaning: str = "", *, filled: bool = False
+) -> npt.NDArray[np.int32]:
+    """A contiguous copy of rows and columns as int32; beyond 32 bits they lie off every map and are cut off there."""
+    found = shaped(values, name, shape, meaning, filled=filled)
+    if found.dtype.kind not in "iu":
+        raise TypeError(f"{name} must be integers, got dtype {found.dtype}")
+    within = found if found.dtype == np.int32 else np.clip(found, _INT32.min, _INT32.max)
+    return np.array(within, np.int32, order="C")
+
+
+@cache
+def _axes(shape: str) -> tuple[int | None, ...]:
+    """The lengths that a shape like "(B, N, 2)" asks for, None where any will do."""
+    axes = [axis.strip() for axis in shape.strip("()").split(",") if axis]
+    return tuple(int(axis) if axis.isdigit() else None for axis in axes)
+
+
+def _as_int(value: object, name: str) -> int:
+    if not isinstance(value, bool):
+        try:
+            return operator.index(value)  # pyright: ignore[reportArgumentType]
+        except TypeError:
+            pass
+    raise TypeError(f"{name} must be an integer, got {value!r}")
+
+
+def _public_name(kind: type) -> str:
+    package = kind.__module__.partition(".")[0]
+    return kind.__name__ if package == "builtins" else f"{package}.{kind.__name__}"

@@ -1,0 +1,86 @@
+"""Where the problems of episodes come from: random ones, a set to draw from, or given ones; in arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from mapf_env import _native, arguments
+from mapf_env.config import EnvConfig
+from mapf_env.generation import random_cases, random_maps
+from mapf_env.instance import Instance
+
+
+class Problems(NamedTuple):
+    """M instances of at most N robots on maps of H x W cells."""
+
+    grids: npt.NDArray[np.bool_]
+    """(M, H, W)"""
+    starts: npt.NDArray[np.int32]
+    """(M, N, 2)"""
+    goals: npt.NDArray[np.int32]
+    """(M, N, 2)"""
+    team_sizes: npt.NDArray[np.int32]
+    """(M,) how many of the N robots are there."""
+
+
+class InstanceSource:
+    """The problems of the environments of one configuration.
+
+    Args:
+        config: Says how large they are, and what random ones are like.
+        cases: Instances to draw from, in place of random ones.
+        fill: Take smaller instances too: the map is filled up with obstacles, and robots are missing.
+
+    Raises:
+        ValueError: If there are no cases, or one does not fit.
+        TypeError: If the cases are no instances.
+    """
+
+    def __init__(self, config: EnvConfig, cases: Sequence[Instance] | None, fill: bool) -> None:
+        self._config, self._cases, self._fill = config, cases, arguments.flag(fill, "fill")
+        if cases is not None and not len(self.stack(cases, "cases").grids):
+            raise ValueError("there are no cases to play: give some, or None for random instances")
+
+    def draw(self, seeds: npt.NDArray[np.uint64]) -> Problems:
+        """One problem for each seed."""
+        if self._cases is None:
+            config, count = self._config, len(seeds)
+            grids = random_maps(
+                seeds, height=config.height, width=config.width, density=config.density, style=config.style
+            )
+            starts, goals = random_cases(seeds, grids, config.num_agents)
+            return Problems(grids, starts, goals, np.full(count, config.num_agents, np.int32))
+        draws = _native.mix(seeds, np.full_like(seeds, np.iinfo(np.uint64).max)) % np.uint64(len(self._cases))
+        return self.stack([self._cases[i] for i in draws.tolist()], "cases")
+
+    def stack(self, instances: Sequence[Instance], name: str) -> Problems:
+        """These instances; messages say `name` of them.
+
+        Raises:
+            ValueError: If one does not fit.
+            TypeError: If one is no instance.
+        """
+        config, given = self._config, list(arguments.each_of(instances, Instance, name))
+        grids = np.ones((len(given), config.height, config.width), np.bool_)
+        starts, goals = (np.zeros((len(given), config.num_agents, 2), np.int32) for _ in range(2))
+        sizes = np.empty(len(given), np.int32)
+        for b, instance in enumerate(given):
+            robots, (height, width) = instance.num_agents, instance.grid.shape
+            if robots > config.num_agents or (robots < config.num_agents and not self._fill):
+                raise ValueError(
+                    f"the instance has {robots} agents, the environment {config.num_agents}: "
+                    f"make it with num_agents={robots}"
+                )
+            small = height < config.height or width < config.width
+            if height > config.height or width > config.width or (small and not self._fill):
+                raise ValueError(
+                    f"the instance's map is {height}x{width}, the environment's {config.height}x{config.width}: "
+                    f"make it with height={height}, width={width}"
+                )
+            grids[b, :height, :width] = instance.grid
+            starts[b, :robots], goals[b, :robots], sizes[b] = instance.starts, instance.goals, robots
+        return Problems(grids, starts, goals, sizes)
