@@ -1,4 +1,4 @@
-"""The site of docs/: `sphinx-build -W --keep-going docs build/site`."""
+"""The site of docs/: `sphinx-build --fail-on-warning docs build/site`."""
 
 import tomllib
 from pathlib import Path
@@ -10,10 +10,12 @@ author = "The mapf-env authors"
 version = release = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 
 default_role = "code"
+highlight_language = "none"  # of blocks that name no language
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 myst_heading_anchors = 3
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True  # as written, so without the paths of the machine that builds
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True}
 autodoc_type_aliases = {"npt.ArrayLike": "ArrayLike"}

@@ -31,7 +31,7 @@ def drawings() -> dict[str, str]:
         "view": view(instance, robot=2, radius=2),
         "channels": channels(instance, robot=2, radius=2),
         "graph": graph(instance, radius=5.0),
-        "vertex_conflict": animate(*walked("A.B\n...", "R", "L", steps=1), title="Vertex conflict"),
+        "vertex_conflict": animate(*walked("bA.Ba", "R", "L", steps=1), title="Vertex conflict"),
         "swap_conflict": animate(*walked("bAB.a", "R", "L", steps=1), title="Swap conflict"),
         "shield": animate(*walked("..B..\n.....\nA...a\n..b..", "RRRR", "DIDD", steps=4), title="One goes, one waits"),
         **{name: animate(*failed, title=name.capitalize().replace("_", " ")) for name, failed in failures().items()},
