@@ -35,6 +35,7 @@ from rich.progress import Progress
 from gnn_policy import checkpoint, evaluation
 from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.execution import Execution
+from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
 from gnn_policy.rollout import rollout
@@ -194,8 +195,14 @@ class Experiment:
                 exam = self._exam(scene)
                 for player in players:
                     progress.update(task, description=f"{scene.name}: {player.name if player else 'baselines'}")
-                    rows = evaluation.baselines(exam) if player is None else self._scores(scene, player, exam)
-                    result = {"cases_per_map": self.options.cases_per_map, **evaluation.as_json(rows, exam)}
+                    rows, failures = (
+                        (evaluation.baselines(exam), {}) if player is None else self._play(scene, player, exam)
+                    )
+                    result = {
+                        "cases_per_map": self.options.cases_per_map,
+                        **evaluation.as_json(rows, exam),
+                        "failures": failures,
+                    }
                     path = self._result(scene, player.name if player else "baselines")
                     path.parent.mkdir(parents=True, exist_ok=True)
                     write_whole(path, json.dumps(result, indent=2) + "\n")
@@ -256,12 +263,16 @@ class Experiment:
         cases = split_cases(config, "test", scene.num_agents)
         return evaluation.Exam.prepare(cases, w=W, timeout=config.timeout, threads=self.options.threads)
 
-    def _scores(self, scene: Scene, model: Model, exam: evaluation.Exam) -> list[evaluation.Score]:
-        policy = checkpoint.load(self.run_of(model))
-        return [
-            evaluation.score(each.name, exam, rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(each)))
-            for each in self._executions(scene, model)
-        ]
+    def _play(
+        self, scene: Scene, model: Model, exam: evaluation.Exam
+    ) -> tuple[list[evaluation.Score], dict[str, dict[Failure, int]]]:
+        """A row for each way to execute the model, and how its teams failed."""
+        policy, rows, failures = checkpoint.load(self.run_of(model)), [], {}
+        for execution in self._executions(scene, model):
+            played = rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(execution))
+            rows.append(evaluation.score(execution.name, exam, played))
+            failures[execution.name] = count_failures(played)
+        return rows, failures
 
     def _training_seconds(self, model: Model) -> float:
         """What the gradient steps of a training take here, and two fifths more for all else."""

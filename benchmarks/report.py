@@ -49,7 +49,7 @@ class Options:
     """Write one page about training runs."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders of `gnn_policy.train`."""
+    """Run folders of `gnn_policy.train`, those of benchmarks/paper.py with what it tested on cells among them."""
     speed: tuple[Path, ...] = ()
     """What benchmarks/speed.py, solvers.py or training.py printed, as text files."""
     out: Path = Path("report.html")
@@ -82,11 +82,14 @@ class Run:
         metrics = folder / "metrics.csv"
         home = next((each for each in (folder / "evaluation", folder) if (each / "results.json").is_file()), None)
         page = (home or folder) / "failures.html"
+        results = json.loads((home / "results.json").read_text(encoding="utf-8"))["num_agents"] if home else {}
+        tests = {N: folder.parent / f"results/20x20-cells-n{N}/{folder.name}.json" for N in TEAMS}
+        tested = {str(N): json.loads(file.read_text(encoding="utf-8")) for N, file in tests.items() if file.is_file()}
         return Run(
             folder.name,
             json.loads((folder / "config.json").read_text(encoding="utf-8"))["num_agents"],
             list(csv.DictReader(io.StringIO(metrics.read_text(encoding="utf-8")))) if metrics.is_file() else [],
-            json.loads((home / "results.json").read_text(encoding="utf-8"))["num_agents"] if home else {},
+            tested or results,
             page.read_text(encoding="utf-8") if page.is_file() else None,
         )
 
@@ -97,14 +100,17 @@ class Run:
     def estimates(self, row: str, measure: str) -> Iterator[tuple[int, float]]:
         """Number of robots and mean of a measure, where there is one."""
         for size, table in self.results.items():
-            (found,) = [each for each in table["rows"] if each["name"].removesuffix(",cost-to-go*") == row]
-            if found[measure]["mean"] is not None:
-                yield int(size), found[measure]["mean"]
+            for found in table["rows"]:
+                if found["name"].removesuffix(",cost-to-go*") == row and found[measure]["mean"] is not None:
+                    yield int(size), found[measure]["mean"]
 
 
 def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
     """The report as HTML."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    here = Path(__file__).parent
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True, check=False
+    )
     names = ", ".join(run.name for run in runs)
     parts = [
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'

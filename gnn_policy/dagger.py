@@ -248,11 +248,11 @@ def _collector(
     settings |= {"num_collectors": players, "sync": True}
     if backend == "process":  # passing open files to spawned processes fails for shared storages
         torch.multiprocessing.set_sharing_strategy("file_system")
-        return Collector(make_env, mixture, backend=backend, **settings, **own)
+        return Collector([make_env] * players, mixture, backend=backend, **settings, **own)
     if importlib.util.find_spec("ray") is None:
         raise ValueError('backend "ray" needs Ray: pip install ray, or choose "process"')
     options = {"collector_kwargs": own, "remote_configs": {"num_cpus": 1, "num_gpus": 0}}
-    return Collector(make_env, mixture, backend=backend, backend_options=options, **settings)
+    return Collector([make_env] * players, mixture, backend=backend, backend_options=options, **settings)
 
 
 class Aggregator:
@@ -308,7 +308,7 @@ class Aggregator:
         seed = int(np.random.SeedSequence([self._config.seed, round_number, self._rank]).generate_state(1)[0])
         self._mixture.begin(self._config.beta_decay**round_number, seed)
         if self._config.backend != "direct":
-            self._collector.update_policy_weights_()
+            self._collector.update_policy_weights_(self._mixture)
         self._collector.set_seed(seed)
         stuck_only = self._config.aggregation == "stuck" and round_number > 0
         cases, positions = [], []

@@ -34,7 +34,8 @@ class Estimate:
         n, share, z = len(outcomes), float(outcomes.mean()), 1.96
         centre = (share + z * z / (2 * n)) / (1 + z * z / n)
         spread = z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-        return Estimate(share, max(centre - spread, 0.0), min(centre + spread, 1.0))
+        # An end that is the share itself, at 0 or 1, is off by rounding.
+        return Estimate(share, min(max(centre - spread, 0.0), share), max(min(centre + spread, 1.0), share))
 
     @staticmethod
     def average(values: npt.NDArray[np.float64]) -> Estimate:

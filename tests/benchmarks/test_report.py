@@ -68,6 +68,21 @@ def test_the_page_has_curves_tables_replays_and_speed(run: Path, tmp_path: Path)
     assert not re.findall(r'(?:src|href)="(?!#|data:)', page), "the page fetches something"
 
 
+def test_a_model_of_the_papers_experiment_shows_what_it_was_tested_on(run: Path, tmp_path: Path) -> None:
+    tables = json.loads((run / "evaluation" / "results.json").read_text())["num_agents"]
+    for N, success in ((6, 0.625), (14, 0.375)):
+        table = tables["10"]
+        table["rows"][0]["success_rate"] = estimate(success)
+        file = tmp_path / f"results/20x20-cells-n{N}/{run.name}.json"
+        file.parent.mkdir(parents=True)
+        file.write_text(json.dumps(table))
+    assert report(run, folder=tmp_path).returncode == 0
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<td>6</td><td>argmax</td>" in page
+    assert "<td>14</td><td>argmax</td>" in page
+    assert "<td>10</td><td>argmax</td>" not in page
+
+
 def test_a_run_that_was_not_examined_has_its_curves(run: Path, tmp_path: Path) -> None:
     (run / "evaluation" / "results.json").unlink()
     assert report(run, "--out", "other.html", folder=tmp_path).returncode == 0

@@ -442,8 +442,8 @@ def test_collectors_side_by_side_play_other_episodes(cases, policy):
     finally:
         aggregator.close()
     assert len(states) == 4 * 24
-    halves = states.positions.reshape(2, -1)
-    assert not np.array_equal(*halves)
+    one, other = states.positions.reshape(2, -1)
+    assert not np.array_equal(one, other)
 
 
 def test_teams_are_shared_evenly_by_collectors(cases, policy):
