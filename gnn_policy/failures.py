@@ -21,12 +21,12 @@ LAST_STEPS = 16
 def failure(instance: Instance, solution: Solution) -> Failure | None:
     """The kind of failure, or None where all robots end on their goals.
 
-    A robot is late if it ends off its goal, and stuck if it is late and came no nearer to its goal (by shortest ways on
+    A robot is late if it ends off its goal, and stalled if it is late and came no nearer to its goal (by shortest ways on
     the empty map) in the last steps than it had ever been before. The first that holds:
 
-    - "out of time": nobody is stuck; with more steps the team might have done it.
-    - "goal blocked": robots that rest on their own goals throughout the last steps cut off a stuck robot from its own.
-    - "deadlock": the stuck robots stand still throughout the last steps.
+    - "out of time": nobody is stalled; with more steps the team might have done it.
+    - "goal blocked": robots that rest on their own goals throughout the last steps cut off a stalled robot from its own.
+    - "deadlock": the stalled robots stand still throughout the last steps.
     - "oscillation": each of them stays on at most two cells, some to and fro.
     - "livelock": they move about and get nowhere.
 
@@ -48,13 +48,13 @@ def failure(instance: Instance, solution: Solution) -> Failure | None:
     rows, cols = paths[..., 0], paths[..., 1]
     robots = np.arange(instance.num_agents)
     distances = _native.distances(instance.grid, instance.goals)[robots, rows, cols]
-    stuck = late & (distances[first:].min(axis=0) >= distances[: first + 1].min(axis=0))
-    if not stuck.any():
+    stalled = late & (distances[first:].min(axis=0) >= distances[: first + 1].min(axis=0))
+    if not stalled.any():
         return "out of time"
     resting = (recent == instance.goals).all(axis=(0, 2))
-    if any(_cut_off(instance, paths[-1, robot], instance.goals[robot], resting) for robot in np.flatnonzero(stuck)):
+    if any(_cut_off(instance, paths[-1, robot], instance.goals[robot], resting) for robot in np.flatnonzero(stalled)):
         return "goal blocked"
-    visited = [len(np.unique(recent[:, robot], axis=0)) for robot in np.flatnonzero(stuck)]
+    visited = [len(np.unique(recent[:, robot], axis=0)) for robot in np.flatnonzero(stalled)]
     return "deadlock" if max(visited) == 1 else "oscillation" if max(visited) == 2 else "livelock"
 
 

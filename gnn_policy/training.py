@@ -166,7 +166,11 @@ class Training:
         found: dict[str, Any] | None = None
         if ranks.rank == 0:
             self._lock = lock_run(folder)
-            open_run(folder, config)
+            try:
+                open_run(folder, config)
+            except (ValueError, OSError):
+                self._lock.release()
+                raise
             (folder / "demonstrations").mkdir(exist_ok=True)
             found = self._read_state()
         found = ranks.from_first(found)

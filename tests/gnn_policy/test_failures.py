@@ -70,22 +70,22 @@ def read(instance: Instance, paths: list[list[oracles.Cell]]) -> str | None:
     late = [i for i, goal in enumerate(goals) if end[i] != goal]
     if not late:
         return None
-    stuck = []
+    stalled = []
     for i in late:
         steps = oracles.distances(instance.grid, goals[i])
         if not any(all(steps[now[i]] < steps[before[i]] for before in earlier) for now in recent):
-            stuck.append(i)
-    if not stuck:
+            stalled.append(i)
+    if not stalled:
         return "out of time"
     walls = instance.grid.copy()
     for i, goal in enumerate(goals):
         if all(now[i] == goal for now in recent):
             walls[goal] = True
-    if any(end[i] not in oracles.distances(walls, goals[i]) for i in stuck):
+    if any(end[i] not in oracles.distances(walls, goals[i]) for i in stalled):
         return "goal blocked"
-    if all(len({now[i] for now in recent}) == 1 for i in stuck):
+    if all(len({now[i] for now in recent}) == 1 for i in stalled):
         return "deadlock"
-    return "oscillation" if all(len({now[i] for now in recent}) <= 2 for i in stuck) else "livelock"
+    return "oscillation" if all(len({now[i] for now in recent}) <= 2 for i in stalled) else "livelock"
 
 
 @st.composite

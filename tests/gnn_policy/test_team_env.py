@@ -38,7 +38,8 @@ def test_under_pibt_it_steps_by_the_values_of_moves(cases):
     generator = np.random.default_rng(1)
     env = TeamEnv(6, cases, max_cycles=7, fov_radius=2, comm_radius=2.5, shield="pibt")
     twin = BatchedEnv(6, max_cycles=7, shield="pibt", **SETTINGS)
-    state = env.reset(seed=11)
+    env.set_seed(11)
+    state = env.reset()
     twin.reset(11, instances=[cases[i] for i in state[CASE].tolist()])
     for _ in range(7):
         values = generator.normal(size=(6, 3, 5)).astype(np.float32)
