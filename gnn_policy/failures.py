@@ -21,11 +21,12 @@ LAST_STEPS = 16
 def failure(instance: Instance, solution: Solution) -> Failure | None:
     """The kind of failure, or None where all robots end on their goals.
 
-    A robot is late if it ends off its goal, and stalled if it is late and came no nearer to its goal (by shortest ways on
-    the empty map) in the last steps than it had ever been before. The first that holds:
+    A robot is late if it ends off its goal, and stalled if it is late and came no nearer to its goal (by shortest ways
+    on the empty map) in the last steps than it had ever been before. The first that holds:
 
     - "out of time": nobody is stalled; with more steps the team might have done it.
-    - "goal blocked": robots that rest on their own goals throughout the last steps cut off a stalled robot from its own.
+    - "goal blocked": robots that rest on their own goals throughout the last steps cut off a stalled robot from its
+      own.
     - "deadlock": the stalled robots stand still throughout the last steps.
     - "oscillation": each of them stays on at most two cells, some to and fro.
     - "livelock": they move about and get nowhere.
