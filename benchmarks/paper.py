@@ -117,7 +117,7 @@ class Model:
             ),
             num_agents=N,
             shield="pibt" if informed else "idle",
-            **{name: getattr(full, name) * max(PAPER) // N for name in counts},
+            **{name: getattr(full, name) * LARGEST // N for name in counts},
         )
 
 
