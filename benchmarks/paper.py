@@ -77,7 +77,8 @@ class Options:
     styles: tuple[MapStyle, ...] = ("cells", "walls")
     """Styles of the test maps, a table each."""
     rows: tuple[str, ...] = ("argmax", "stuck")
-    """How the policies are executed, as in gnn_policy.evaluate; the informed one under both shields."""
+    """How the policies are executed, as in gnn_policy.evaluate; the informed one under the PIBT shield, which it is
+    trained under."""
     own_size_rows: tuple[str, ...] = ("sampled",)
     """Further ways, for figure 2 alone: on teams of the size that a model was trained on."""
     cases_per_map: int = 50
@@ -246,8 +247,8 @@ class Experiment:
 
     def _executions(self, scene: Scene, model: Model) -> list[Execution]:
         names = self.options.rows + (self.options.own_size_rows if _own_size(scene, model) else ())
-        both = names + tuple(f"{name},pibt" for name in self.options.rows) if model.kind == "informed" else names
-        return [Execution.parse(name) for name in both]
+        shield = ",pibt" if model.kind == "informed" else ""
+        return [Execution.parse(name + shield) for name in names]
 
     def _result(self, scene: Scene, player: str) -> Path:
         return self.options.folder / "results" / scene.name / f"{player}.json"

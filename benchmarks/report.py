@@ -35,10 +35,6 @@ main{max-width:1000px;margin:auto;padding:16px}
 h1{font-size:24px}h2{font-size:19px;margin-top:36px}
 section{display:flex;flex-wrap:wrap;gap:12px}
 section svg{flex:1 1 330px;min-width:0;max-width:100%;height:auto}
-div.wide{overflow-x:auto}
-table{border-collapse:collapse;background:#fff}
-td,th{border:1px solid #cbd2da;padding:4px 9px;text-align:right;white-space:nowrap}
-td:first-child,th:first-child{text-align:left}
 iframe{width:100%;height:760px;border:1px solid #cbd2da;border-radius:6px;background:#fff}
 pre{background:#fff;border:1px solid #cbd2da;padding:10px;overflow-x:auto;font-size:12px}
 """
@@ -124,7 +120,7 @@ def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
     if examined:
         parts += ["<h2>Success and flowtime against the number of robots</h2>", against_robots(examined)]
         parts += ["<h2>Success beside the paper's</h2>", heat_maps(examined)]
-        parts += ["<h2>Why teams failed</h2>", failure_table(examined)]
+        parts += ["<h2>Why teams failed</h2>", failures(examined)]
     for run in examined:
         if run.failures is not None:
             parts.append(
@@ -146,7 +142,7 @@ def curves(runs: Sequence[Run]) -> str:
         loss.plot([int(each["samples"]) / 1e6 for each in run.metrics], [float(each["loss"]) for each in run.metrics])
     success.set(xlabel="million robot states", ylabel="validation success, argmax")
     loss.set(xlabel="million robot states", ylabel="cross-entropy")
-    success.legend()
+    legend(success)
     return side_by_side(success, loss)
 
 
@@ -162,7 +158,7 @@ def against_robots(runs: Sequence[Run]) -> str:
         success.plot(TEAMS, PAPER[size], linestyle="--", color="black", label=f"paper, trained on {size}")
     success.set(xlabel="robots", ylabel="success rate", ylim=(None, 1.005))
     flowtime.set(xlabel="robots", ylabel="flowtime increase")
-    success.legend(fontsize="small")
+    legend(success)
     return side_by_side(success, flowtime)
 
 
@@ -192,22 +188,32 @@ def heat_map(name: str, table: dict[int, dict[int, float]], sizes: Sequence[int]
     return map_axes
 
 
-def failure_table(runs: Sequence[Run]) -> str:
-    """How many cases failed in which way."""
-    kinds = get_args(Failure)
-    head = "".join(f"<th>{name}</th>" for name in ("run", "robots", "execution", "cases", *kinds))
-    lines = [
-        "".join(
-            f"<td>{escape(str(cell))}</td>"
-            for cell in (run.name, size, row, table["cases"], *(found.get(kind, 0) for kind in kinds))
-        )
-        for run in runs
-        for size, table in run.results.items()
-        for row, found in table["failures"].items()
-    ]
-    return (
-        f'<div class="wide"><table><tr>{head}</tr>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
-    )
+def failures(runs: Sequence[Run]) -> str:
+    """How many of the cases failed in which way, a diagram for each way of execution of each run."""
+    return side_by_side(*(failure_bars(run, row) for run in runs for row in run.rows()))
+
+
+def failure_bars(run: Run, row: str) -> Axes:
+    """Failed cases by the number of robots, the kinds upon one another."""
+    bars = axes()
+    sizes, upon = list(run.results), np.zeros(len(run.results))
+    for kind in get_args(Failure):
+        found = np.array([table["failures"][row].get(kind, 0) for table in run.results.values()])
+        bars.bar(sizes, found, bottom=upon, label=kind)
+        upon += found
+    for size, total in zip(sizes, upon, strict=True):
+        bars.annotate(f"{total:.0f}", (size, total), ha="center", va="bottom")
+    cases = sorted({table["cases"] for table in run.results.values()})
+    bars.set(title=f"{run.name}, {row}", xlabel="robots", ylabel=f"failed of {'/'.join(map(str, cases))} cases")
+    bars.margins(y=0.12)
+    legend(bars)
+    return bars
+
+
+def legend(diagram: Axes) -> None:
+    """Under the diagram, where it covers nothing."""
+    names = diagram.get_legend_handles_labels()
+    cast(Figure, diagram.figure).legend(*names, fontsize="small", loc="outside lower center", ncols=3)
 
 
 def axes() -> Axes:

@@ -223,9 +223,10 @@ RECIPES: dict[Recipe, TrainConfig] = {
         styles=("cells", "walls"),
         train_maps=4000,
         cases_per_map=20,
+        validation_cases_per_map=10,
         w=1.0,
-        epochs=60,
-        validate_every=10,
+        epochs=120,
+        validate_every=20,
     ),
     "paper": TrainConfig(),
 }

@@ -59,7 +59,8 @@ class Command:
     seed: int | None = None
     """Of sampling and of the shield's tie-breaking."""
     failures: int = 0
-    """How many of the worst cases of the first row to replay beside the expert's solutions, in failures.html."""
+    """How many cases of the first row to replay beside the expert's solutions, in failures.html: the worst of each kind
+    of failure, then the next worst."""
     out: Path | None = None
     """Folder for results.json and pictures; if not given, evaluation/ in the run folder or beside the file, and
     in the working folder for the policy that comes with the package."""

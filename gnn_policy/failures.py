@@ -75,29 +75,26 @@ def count_failures(played: Rollouts) -> dict[Failure, int]:
 
 
 def worst(played: Rollouts, expert: Sequence[Solution], count: int) -> list[Scene]:
-    """Up to `count` of the played cases beside the expert's solutions, the worst first.
+    """Up to `count` of the played cases beside the expert's solutions: the worst of each kind of failure, then the rest.
 
-    Failed cases come before solved ones, those with more robots off their goals before others, then those whose
-    flowtime exceeds the expert's by more.
+    Among both failed cases come before solved ones, those with more robots off their goals before others, then those
+    whose flowtime exceeds the expert's by more.
     """
-    off_goal = [
-        int((solution.paths[-1] != instance.goals).any(axis=1).sum())
-        for instance, solution in zip(played.instances, played.solutions, strict=True)
-    ]
+    cases = list(zip(played.instances, played.solutions, strict=True))
+    kinds = [failure(*case) for case in cases]
+    off_goal = [int((solution.paths[-1] != instance.goals).any(axis=1).sum()) for instance, solution in cases]
     costs = np.array([each.sum_of_costs for each in expert])
     increase = (played.flowtime - costs) / np.maximum(costs, 1)
-    order = np.lexsort([-increase, -np.array(off_goal)])[:count]
+    order = [int(case) for case in np.lexsort([-increase, -np.array(off_goal)])]
+    examples = {next(case for case in order if kinds[case] == kind) for kind in set(kinds) - {None}}
+    order.sort(key=lambda case: case not in examples)
     return [
         Scene(
-            f"{instance.num_agents} robots, case {case}: {_outcome(instance, played.solutions[case], off_goal[case])}, "
-            f"flowtime {increase[case]:+.0%}",
-            instance,
-            {"policy": played.solutions[case], "expert": expert[case]},
+            f"{cases[case][0].num_agents} robots, case {case}: "
+            + (f"{kinds[case]}, {off_goal[case]} not on goal" if kinds[case] else "solved")
+            + f", flowtime {increase[case]:+.0%}",
+            cases[case][0],
+            {"policy": cases[case][1], "expert": expert[case]},
         )
-        for case, instance in ((int(case), played.instances[case]) for case in order)
+        for case in order[:count]
     ]
-
-
-def _outcome(instance: Instance, solution: Solution, off_goal: int) -> str:
-    kind = failure(instance, solution)
-    return "solved" if kind is None else f"{kind}, {off_goal} not on goal"

@@ -48,8 +48,8 @@ def examine(
         variants: How to execute the policy, one row for each.
         split: Which maps.
         threads: CPU threads of the expert.
-        failures: How many of the worst cases of the first variant to show beside the expert's solutions, for each team
-            size, in failures.html.
+        failures: How many cases of the first variant to show beside the expert's solutions, for each team size, in
+            failures.html; the worst of each kind of failure come first.
 
     Raises:
         ValueError: If there is no variant, or `failures` is negative.

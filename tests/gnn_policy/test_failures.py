@@ -132,22 +132,24 @@ def judged(instances, solutions):
     )
 
 
-def test_the_worst_cases_come_first_beside_the_experts_solutions():
+def test_the_worst_of_each_kind_come_first_beside_the_experts_solutions():
     plain = parse_instance("A.a\n...\nB.b")
     between = plain.starts + np.array([0, 1])
     straight = Solution(np.array([plain.starts, between, plain.goals]))
     slow = Solution(np.array([plain.starts, *4 * [between], plain.goals]))
     one_fails = walked(plain, "RR" + 46 * "I", "I")
     both_fail = walked(plain, "I", "I")
-    played = judged([plain] * 4, [straight, one_fails, slow, both_fail])
-    scenes = worst(played, [straight] * 4, 3)
+    one_swings = walked(plain, "RR" + 46 * "I", "RL")
+    played = judged([plain] * 5, [straight, one_fails, slow, both_fail, one_swings])
+    scenes = worst(played, [straight] * 5, 4)
     assert [scene.title for scene in scenes] == [
         "2 robots, case 3: deadlock, 2 not on goal, flowtime +1900%",
+        "2 robots, case 4: oscillation, 1 not on goal, flowtime +950%",
         "2 robots, case 1: deadlock, 1 not on goal, flowtime +950%",
         "2 robots, case 2: solved, flowtime +150%",
     ]
     assert [dict(scene.solutions) for scene in scenes] == [
-        {"policy": each, "expert": straight} for each in (both_fail, one_fails, slow)
+        {"policy": each, "expert": straight} for each in (both_fail, one_swings, one_fails, slow)
     ]
-    assert worst(played, [straight] * 4, 0) == []
-    assert count_failures(played) == {"deadlock": 2}
+    assert worst(played, [straight] * 5, 0) == []
+    assert count_failures(played) == {"deadlock": 2, "oscillation": 1}
