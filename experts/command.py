@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NoReturn
 
 from experts import arguments
 from experts.many import SOLVER_NAMES, solver_named
 from experts.paths import load_paths, save_paths
-from mapf_env import animate, load_instances, load_map, load_scen, random_instance
-from mapf_env.instance import Instance
+from mapf_env import Instance, animate
+from mapf_env.problem_file import load_problem
 
 _EXIT_CODES = """exit status: 0 solved or valid, 1 not solved or invalid, 2 an error in the arguments or a file"""
 _MOST_VIOLATIONS = 20
@@ -103,34 +102,8 @@ def _add_problem(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of random robots and of the solver (default: 0)")
 
 
-def _load(file: str, options: argparse.Namespace, num_agents: int | None) -> Instance:
-    kind = Path(file).suffix.lower()
-    if options.map is not None and kind in (".map", ".json"):
-        raise ValueError(f"--map goes with a scenario only: {file} has its map already")
-    if options.index is not None and kind != ".json":
-        raise ValueError(f"--index goes with a set of instances (.json) only, and {file} is none")
-    if kind == ".json":
-        return _of_set(file, options.index or 0, num_agents)
-    if kind != ".map":
-        return load_scen(file, num_agents, options.map)
-    if num_agents is None:
-        raise ValueError("robots on a map are placed at random: give --agents N (and --seed S)")
-    return random_instance(grid=load_map(file), num_agents=num_agents, seed=options.seed)
-
-
-def _of_set(file: str, index: int, num_agents: int | None) -> Instance:
-    instances = load_instances(file)
-    if not 0 <= index < len(instances):
-        raise ValueError(f"{file} holds {len(instances)} instances, counted from 0: there is no --index {index}")
-    instance = instances[index]
-    if num_agents is None:
-        return instance
-    if not 1 <= num_agents <= instance.num_agents:
-        raise ValueError(
-            f"{num_agents} agents asked for, but instance {index} of {file} has {instance.num_agents}: "
-            f"give --agents in 1..{instance.num_agents}"
-        )
-    return Instance(instance.grid, instance.starts[:num_agents], instance.goals[:num_agents])
+def _load(file: str, options: argparse.Namespace, agents: int | None) -> Instance:
+    return load_problem(file, agents=agents, map=options.map, index=options.index, seed=options.seed)
 
 
 def _solve(options: argparse.Namespace) -> int:

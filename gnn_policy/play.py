@@ -18,7 +18,8 @@ from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
 from gnn_policy.execution import Execution
 from gnn_policy.failures import failure
 from gnn_policy.rollout import rollout
-from mapf_env import EnvConfig, Instance, _native, load_map, load_scen, random_instance, replay
+from mapf_env import EnvConfig, Instance, _native, replay
+from mapf_env.problem_file import load_problem
 
 PATIENCE = 4
 """T_max in lengths of the longest way that a robot has to go."""
@@ -29,13 +30,15 @@ class Command:
     """Play a policy on a map of your own and write a page that replays it in any browser."""
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """A map (.map) in the MovingAI format, or a scenario (.scen) beside its map."""
+    """A map (.map) in the MovingAI format, a scenario (.scen) beside its map, or a set of instances (.json)."""
     agents: int | None = None
-    """How many robots: placed at random on a map, the first ones of a scenario (all of them if not given)."""
+    """How many robots: placed at random on a map, else the first ones of the file (all of them if not given)."""
     run: Path = checkpoint.PACKAGED
     """A run folder of training, or a .safetensors file; the policy that comes with the package if not given."""
     map: Path | None = None
     """The map of a scenario, if it does not lie beside it."""
+    index: int | None = None
+    """Which instance of a set, from 0; the first if not given."""
     row: str = "stuck"
     """How to execute the policy, in the words of the rows of `python -m gnn_policy.evaluate`."""
     max_steps: int | None = None
@@ -56,7 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         torch.set_num_threads(cpu_threads(command.threads))
         policy, execution = checkpoint.load(command.run), Execution.parse(command.row)
-        instance = _problem(command)
+        instance = load_problem(
+            command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed
+        )
         steps = _patience(instance) if command.max_steps is None else command.max_steps
         out = command.out or Path(f"{command.file.stem}.html")
         if not out.parent.is_dir():
@@ -78,18 +83,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         replay(instance, solution, out, title=told, config=radii)
         console.print(f"{told} ({seconds:.1f} s)", highlight=False)
         console.print(f"replay: {out}", highlight=False, soft_wrap=True)
-
-
-def _problem(command: Command) -> Instance:
-    if command.file.suffix == ".scen":
-        return load_scen(command.file, command.agents, command.map)
-    if command.file.suffix != ".map":
-        raise ValueError(f"{command.file} must be a map (.map) or a scenario (.scen)")
-    if command.map is not None:
-        raise ValueError("--map goes with a scenario only: the map is given already")
-    if command.agents is None:
-        raise ValueError("robots on a map are placed at random: give --agents N (and --seed S)")
-    return random_instance(grid=load_map(command.file), num_agents=command.agents, seed=command.seed)
 
 
 def _patience(instance: Instance) -> int:

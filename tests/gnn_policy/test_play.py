@@ -9,7 +9,7 @@ import torch
 
 import oracles
 from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, play, rollout, save
-from mapf_env import load_scen, random_instance, save_map, save_scen
+from mapf_env import load_scen, random_instance, save_instances, save_map, save_scen
 
 
 @pytest.fixture
@@ -53,6 +53,14 @@ def test_a_scenario_is_played_as_it_stands(home, capsys):
     assert f"6 robots on 9 x 12 cells: {home_now} on goal after 30 steps, failed: " in told
     assert data["title"] in told
     assert "replay: own.html" in told
+
+
+def test_an_instance_of_a_set_is_played(home):
+    instances = [random_instance(height=5, width=5, num_agents=3, seed=seed) for seed in range(2)]
+    save_instances("set.json", instances)
+    played("set.json", "--index", "1", "--max-steps", "3")
+    (scene,) = shown(home / "set.html")["scenes"]
+    assert scene["goals"] == instances[1].goals.tolist()
 
 
 def test_robots_are_placed_on_a_map_by_the_seed(home):
@@ -99,6 +107,7 @@ def test_a_team_that_is_home_has_solved_it(home, capsys):
         ("own.map --agents 999", "999"),
         ("own.scen --agents 7", "only 6 entries"),
         ("own.map --agents 3 --map own.map", "--map goes with a scenario only"),
+        ("own.map --agents 3 --index 0", "--index goes with a set of instances"),
         ("own.map --agents 3 --seed -1", "seed"),
         ("own.map --agents 3 --max-steps 0", "max_steps must be at least 1"),
         ("own.map --agents 3 --threads -1", "threads"),
