@@ -75,10 +75,10 @@ def count_failures(played: Rollouts) -> dict[Failure, int]:
 
 
 def worst(played: Rollouts, expert: Sequence[Solution], count: int) -> list[Scene]:
-    """Up to `count` of the played cases beside the expert's solutions: the worst of each kind of failure, then the rest.
+    """Up to `count` of the played cases beside the expert's solutions, the worst of each kind of failure first.
 
-    Among both failed cases come before solved ones, those with more robots off their goals before others, then those
-    whose flowtime exceeds the expert's by more.
+    Then, as among these, failed cases come before solved ones, those with more robots off their goals before others,
+    then those whose flowtime exceeds the expert's by more.
     """
     cases = list(zip(played.instances, played.solutions, strict=True))
     kinds = [failure(*case) for case in cases]

@@ -11,9 +11,7 @@ from mapf_env.instance_set import load_instances
 from mapf_env.movingai import load_map, load_scen
 
 
-def load_problem(
-    file: PathLike, *, agents: int | None, map: PathLike | None, index: int | None, seed: int
-) -> Instance:
+def load_problem(file: PathLike, *, agents: int | None, map: PathLike | None, index: int | None, seed: int) -> Instance:
     """The instance that a file and the options beside it define; messages speak of the options by their names there.
 
     Args:

@@ -7,34 +7,11 @@ import sys
 import pytest
 import torch
 
-from gnn_policy import PolicyConfig
-from gnn_policy.config import TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.ranks import Ranks
+from small_training import CONFIG
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="gloo and POSIX signals")
-
-CONFIG = TrainConfig(
-    policy=PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=3.0),
-    num_agents=3,
-    height=6,
-    width=6,
-    train_maps=6,
-    cases_per_map=2,
-    validation_maps=3,
-    validation_cases_per_map=2,
-    test_maps=2,
-    epochs=3,
-    updates_per_epoch=3,
-    batch_size=8,
-    demonstration_steps=64,
-    dagger_every=1,
-    dagger_steps=32,
-    rollout_teams=4,
-    rollout_length=8,
-    validate_every=2,
-    threads=1,
-)
 
 WORKER = """
 import os, signal, sys

@@ -20,32 +20,10 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gnn_policy import PolicyConfig, load, rollout, training
-from gnn_policy.config import TrainConfig
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.training import Training, open_run, split_cases
-
-CONFIG = TrainConfig(
-    policy=PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=3.0),
-    num_agents=3,
-    height=6,
-    width=6,
-    train_maps=6,
-    cases_per_map=2,
-    validation_maps=3,
-    validation_cases_per_map=2,
-    test_maps=2,
-    epochs=3,
-    updates_per_epoch=3,
-    batch_size=8,
-    demonstration_steps=64,
-    dagger_every=1,
-    dagger_steps=32,
-    rollout_teams=4,
-    rollout_length=8,
-    validate_every=2,
-    threads=1,
-)
+from small_training import CONFIG
 
 
 class Silence(TrainingProgress):
