@@ -1,7 +1,10 @@
 """The site of docs/: `sphinx-build --fail-on-warning docs build/site`."""
 
+import re
 import tomllib
 from pathlib import Path
+
+from experts import arguments
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,10 +35,16 @@ html_show_copyright = False
 
 
 def setup(app):
-    """Keep napoleon from reading the words before an attribute's first colon as its type."""
+    """Defaults as numbers; and keep napoleon from reading the words before an attribute's first colon as its type."""
+
+    def numbers(app, what, name, subject, options, signature, returned):
+        return re.sub(
+            r"arguments\.(DEFAULT_\w+)", lambda found: repr(getattr(arguments, found[1])), signature or ""
+        ), returned
 
     def comma(app, what, name, subject, options, lines):
         if what in ("attribute", "property", "data") and lines:
             lines[0] = lines[0].replace(": ", ", ", 1)
 
+    app.connect("autodoc-process-signature", numbers)
     app.connect("autodoc-process-docstring", comma, priority=400)
