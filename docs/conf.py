@@ -38,9 +38,10 @@ def setup(app):
     """Defaults as numbers; and keep napoleon from reading the words before an attribute's first colon as its type."""
 
     def numbers(app, what, name, subject, options, signature, returned):
-        return re.sub(
-            r"arguments\.(DEFAULT_\w+)", lambda found: repr(getattr(arguments, found[1])), signature or ""
-        ), returned
+        if signature:
+            shown = re.sub(r"arguments\.(DEFAULT_\w+)", lambda name: repr(getattr(arguments, name[1])), signature)
+            return shown, returned
+        return None
 
     def comma(app, what, name, subject, options, lines):
         if what in ("attribute", "property", "data") and lines:
