@@ -15,8 +15,6 @@ PIBT shield. Each finished model and each tested pair is a file; whatever is the
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -38,8 +36,9 @@ from gnn_policy.execution import Execution
 from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
+from gnn_policy.progress import TrainingProgress
 from gnn_policy.rollout import rollout
-from gnn_policy.training import split_cases
+from gnn_policy.training import Training, split_cases
 from mapf_env.files import replacing, write_whole
 from mapf_env.generation import MapStyle
 
@@ -173,11 +172,10 @@ class Experiment:
         for model in self.models:
             if self.is_trained(model):
                 continue
-            self.console.rule(f"training on {model.num_agents} robots, K = {model.taps}")
-            command = [sys.executable, "-m", "gnn_policy.train", "--run", str(self.run_of(model))]
-            command += ["--recipe", "full", "--threads", str(self.options.threads), *_arguments(model.config)]
-            command += ["--test-maps", "1"]  # the test is this program's
-            subprocess.run(command, check=True)
+            self.console.rule(f"training {model.name}")
+            config = replace(model.config, threads=self.options.threads)
+            with TrainingProgress(config.epochs, self.console) as progress:
+                Training(config, self.run_of(model), progress).run()
 
     def test(self) -> None:
         """Play every trained model on the test cases; results that exist are kept."""
@@ -229,7 +227,8 @@ class Experiment:
 
     def is_trained(self, model: Model) -> bool:
         """Whether its training has come to its end."""
-        return (self.run_of(model) / "results.json").exists()
+        metrics = self.run_of(model) / "metrics.csv"
+        return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.epochs
 
     @staticmethod
     def _wanted(model: Model) -> bool:
@@ -410,17 +409,6 @@ class Experiment:
             if path.exists():
                 return [row["name"] for row in json.loads(path.read_text())["rows"]]
         return []
-
-
-def _arguments(config: TrainConfig) -> list[str]:
-    """What the command line of training says to get these settings from the recipe "full"."""
-    words = []
-    for prefix, mine, recipe in (("", config, RECIPES["full"]), ("policy.", config.policy, RECIPES["full"].policy)):
-        for name, value in asdict(mine).items():
-            if name != "policy" and value != getattr(recipe, name):
-                option = f"--{prefix}{name}".replace("_", "-")
-                words += [option] if value is True else [option, str(value)]
-    return words
 
 
 def _own_size(scene: Scene, model: Model) -> bool:

@@ -16,7 +16,7 @@ from gnn_policy import checkpoint
 from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
-from gnn_policy.results import VARIANTS, examine
+from gnn_policy.results import examine
 from mapf_env.generation import MapStyle
 
 
@@ -31,11 +31,11 @@ class Command:
     """A run folder of training, or a .safetensors file; the policy that comes with the package if not given."""
     num_agents: tuple[int, ...] = ()
     """Team sizes N, one table for each."""
-    rows: tuple[str, ...] = tuple(each.name for each in VARIANTS)
+    rows: tuple[str, ...] | None = None
     """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled" or "stuck"
     (drawn by stuck robots and their neighbours); for the latter two a temperature; the shield, "idle" or "pibt"; who
     hears whom, "fixed" or "connected" (the radius grows until the team is connected); edge weights, "binary" or
-    "distance"."""
+    "distance". If not given: argmax, stuck and sampled, under the shield of training."""
     split: Literal["validation", "test"] = "test"
     """Which maps: "validation" to choose a row by, "test" to report it."""
     maps: int | None = None
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.evaluate"
         )
         policy = checkpoint.load(command.run)
-        variants = [Execution.parse(row) for row in command.rows]
+        variants = None if command.rows is None else [Execution.parse(row) for row in command.rows]
         names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         prefix = "validation_" if command.split == "validation" else ""

@@ -21,9 +21,6 @@ from gnn_policy.training import split_cases
 from mapf_env import EnvConfig, Scene, animate, replay_scenes
 from mapf_env.files import write_whole
 
-VARIANTS = (Execution(), Execution(sample="stuck"), Execution(sample=True))
-"""The rows of a table where nothing else is asked for."""
-
 
 def examine(
     policy: DecentralizedPolicy,
@@ -32,7 +29,7 @@ def examine(
     console: Console,
     *,
     num_agents: Sequence[int] = (),
-    variants: Sequence[Execution] = VARIANTS,
+    variants: Sequence[Execution] | None = None,
     split: Split = "test",
     threads: int,
     failures: int = 0,
@@ -45,7 +42,8 @@ def examine(
         folder: Where the files go.
         console: Where the tables go.
         num_agents: Team sizes N; that of `config` if none is given.
-        variants: How to execute the policy, one row for each.
+        variants: How to execute the policy, one row for each; if not given argmax, stuck robots draw, and all do, under
+            the shield of training.
         split: Which maps.
         threads: CPU threads of the expert.
         failures: How many cases of the first variant to show beside the expert's solutions, for each team size, in
@@ -55,6 +53,8 @@ def examine(
         ValueError: If there is no variant, or `failures` is negative.
         FileExistsError: If the folder has results of other settings.
     """
+    if variants is None:
+        variants = [Execution(sample=sample, shield=config.shield) for sample in (False, "stuck", True)]
     if not variants:
         raise ValueError("there is no way to execute the policy: give at least one row")
     if failures < 0:

@@ -2,16 +2,26 @@
 
 import json
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from gnn_policy.config import RECIPES
-from gnn_policy.train import parse
+from gnn_policy.progress import TrainingProgress
+from gnn_policy.training import Training
+from small_training import CONFIG
 
 PAPER = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "paper.py"))
 Experiment, Model, Options, Scene = (PAPER[name] for name in ("Experiment", "Model", "Options", "Scene"))
+
+
+class Stop(TrainingProgress):
+    """Somebody who stops the training after its first round."""
+
+    def finished(self, row):
+        raise KeyboardInterrupt
 
 
 def experiment(folder: Path, **changes: object):
@@ -29,7 +39,7 @@ def experiment(folder: Path, **changes: object):
 def finish(whole, model, success: float = 0.5) -> None:
     """Write what a training and a test of the model leave."""
     whole.run_of(model).mkdir(parents=True)
-    (whole.run_of(model) / "results.json").write_text("{}")
+    (whole.run_of(model) / "metrics.csv").write_text("a round\n" * (1 + model.config.epochs))
     estimate = {"mean": success, "low": success - 0.1, "high": success + 0.1}
     measures = ("success_rate", "flowtime_increase", "flowtime_increase_solved", "makespan")
     rows = [{"name": "argmax", **dict.fromkeys(measures, estimate)}]
@@ -51,7 +61,7 @@ def test_figure_two_tests_every_k_on_its_own_size_and_figure_three_k_3_on_all(tm
     assert beyond == connected | {(f"20x20-cells-n{N}", "n12-k3-informed") for N in (4, 6, 8, 10, 12, 14)}
 
 
-def test_models_are_drawn_from_on_teams_of_their_own_size_and_the_informed_one_plays_under_both_shields(tmp_path):
+def test_models_are_drawn_from_on_teams_of_their_own_size_and_the_informed_one_plays_under_its_shield(tmp_path):
     whole = experiment(tmp_path)
 
     def names(N, model):
@@ -59,14 +69,7 @@ def test_models_are_drawn_from_on_teams_of_their_own_size_and_the_informed_one_p
 
     assert names(4, Model(4, 3)) == ["argmax", "stuck,1", "sampled,1"]
     assert names(6, Model(4, 3)) == ["argmax", "stuck,1"]
-    assert names(14, Model(12, 3, "informed")) == ["argmax", "stuck,1", "argmax,pibt", "stuck,1,pibt"]
-
-
-@pytest.mark.parametrize(
-    "model", [Model(4, 3), Model(10, 1), Model(12, 2), Model(12, 3, "connected"), Model(12, 3, "informed")]
-)
-def test_the_command_trains_the_model_that_is_meant(model):
-    assert parse(["--recipe", "full", *PAPER["_arguments"](model.config)]).config == model.config
+    assert names(14, Model(12, 3, "informed")) == ["argmax,pibt", "stuck,1,pibt"]
 
 
 def test_rounds_have_equally_many_robot_states_for_every_size_of_the_team():
@@ -77,16 +80,22 @@ def test_rounds_have_equally_many_robot_states_for_every_size_of_the_team():
             assert getattr(config, name) * N == pytest.approx(getattr(full, name) * 12, rel=0.02)
 
 
-def test_only_what_is_missing_is_trained(tmp_path, monkeypatch):
-    whole, trained = experiment(tmp_path, taps=(3,)), []
+def test_only_what_is_missing_is_trained_and_a_training_that_was_stopped_goes_on(tmp_path, monkeypatch):
+    shorter = replace(CONFIG, epochs=2)
+    monkeypatch.setitem(RECIPES, "full", shorter)
+    whole = experiment(tmp_path, taps=(3,))
     finish(whole, Model(4, 3))
-    monkeypatch.setattr("subprocess.run", lambda command, check: trained.append(command))
+    run = whole.run_of(Model(12, 3))
+    stopped = Training(whole.models[-1].config, run, Stop(2, Console(quiet=True)))
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run()
+    assert not whole.is_trained(Model(12, 3))
+    first = (run / "metrics.csv").read_text()
     whole.train()
-    (command,) = trained
-    assert command[1:3] == ["-m", "gnn_policy.train"]
-    assert command[command.index("--recipe") + 1] == "full"
-    assert command[command.index("--num-agents") + 1] == "12"
-    assert command[command.index("--run") + 1] == str(tmp_path / "n12-k3")
+    assert whole.is_trained(Model(12, 3))
+    assert (run / "metrics.csv").read_text().startswith(first)
+    assert json.loads((run / "config.json").read_text())["num_agents"] == 12
+    assert {each.name for each in tmp_path.iterdir() if each.is_dir()} == {"n4-k3", "n12-k3", "results"}
 
 
 def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):

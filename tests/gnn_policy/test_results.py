@@ -73,3 +73,14 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
         "timeout": 3.0,
         "seed": 0,
     }
+
+
+def test_the_rows_are_played_under_the_shield_of_training(tmp_path):
+    torch.manual_seed(0)
+    policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))
+    config = TrainConfig(
+        policy=policy.config, num_agents=2, height=5, width=5, density=0.0, test_maps=1, cases_per_map=1, shield="pibt"
+    )
+    results.examine(policy, config, tmp_path, Console(file=io.StringIO(), width=80), threads=1)
+    rows = json.loads((tmp_path / "results.json").read_text())["num_agents"]["2"]["rows"]
+    assert [row["name"] for row in rows][:4] == ["argmax,pibt", "stuck,1,pibt", "sampled,1,pibt", "random"]
