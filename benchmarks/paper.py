@@ -135,6 +135,13 @@ class Scene:
         return f"{self.size}x{self.size}-{self.style}-n{self.num_agents}"
 
 
+MEASURES = {
+    "success_rate": "Success: all robots on goal at once",
+    "latched": "Latched success: every robot has touched its goal, as in the released code",
+    "flowtime_increase": "Flowtime increase over all cases, a failure counts T_max",
+    "flowtime_increase_solved": "Flowtime increase over solved cases",
+    "makespan": "Makespan of solved cases",
+}
 LARGE = tuple((50, N) for N in (20, 40, 60))
 """Side of the map and size of the team of the longer paper's large maps."""
 LARGEST = max(PAPER)
@@ -378,30 +385,60 @@ class Experiment:
         for style in self.options.styles:
             for size in dict.fromkeys(scene.size for scene in self.scenes):
                 scenes = [scene for scene in self.scenes if (scene.style, scene.size) == (style, size)]
-                yield f"## {style} maps, {size} x {size}\n"
-                for measure in ("success_rate", "flowtime_increase", "flowtime_increase_solved", "makespan"):
-                    yield f"### {measure.replace('_', ' ')}\n"
+                scenes = [scene for scene in scenes if any(self._row(scene, *each) for each in self._players(scenes))]
+                if not scenes:
+                    continue
+                tested = [json.loads(self._result(scene, "baselines").read_text()) for scene in scenes]
+                yield f"## {style.capitalize()}, {size} x {size}\n"
+                cases = sorted({str(each["cases"]) for each in tested})
+                yield f"{' or '.join(cases)} cases for each number of robots. "
+                over = max(each["expert_over_bound"] for each in tested)
+                yield f"The expert's flowtime is at most {over:.4f} of its lower bound in the mean of a column.\n"
+                if size == 20:
+                    for row in self.variants:
+                        yield from self._figure3_table(style, row)
+                for measure, title in MEASURES.items():
+                    yield f"### {title}\n"
                     yield from self._table(scenes, measure)
                     yield ""
 
+    def _figure3_table(self, style: MapStyle, row: str) -> Iterator[str]:
+        found = {N: [self._row(Scene(style, size), Model(N, 3).name, row) for size in TEAMS] for N in PAPER}
+        if not all(any(line) for line in found.values()):
+            return
+        yield f"### Figure 3, {row}: success, its 95 % interval, the difference to the paper\n"
+        yield "| trained on | " + " | ".join(map(str, TEAMS)) + " |"
+        yield "|---|" + "---|" * len(TEAMS)
+        for N, line in found.items():
+            cells = [
+                f"{_cell('success_rate', each)} {each['success_rate']['mean'] - paper:+.3f}" if each else ""
+                for each, paper in zip(line, PAPER[N], strict=True)
+            ]
+            yield f"| {N} | " + " | ".join(cells) + " |"
+        yield ""
+
     def _table(self, scenes: Sequence[Scene], measure: str) -> Iterator[str]:
-        yield "| player | " + " | ".join(str(scene.num_agents) for scene in scenes) + " |"
+        yield "| robots | " + " | ".join(str(scene.num_agents) for scene in scenes) + " |"
         yield "|---|" + "---|" * len(scenes)
-        players = [
+        for player, row in self._players(scenes):
+            found = [self._row(scene, player, row) for scene in scenes]
+            if any(found):
+                cells = [_cell(measure, each) if each else "" for each in found]
+                yield f"| {row if player == 'baselines' else f'{player} {row}'} | " + " | ".join(cells) + " |"
+        if measure == "success_rate" and scenes[0].size == 20:
+            for trained_on, values in PAPER.items():
+                line = dict(zip(TEAMS, values, strict=True))
+                cells = [f"{line[scene.num_agents]:.3f}" for scene in scenes]
+                yield f"| paper, trained on {trained_on} | " + " | ".join(cells) + " |"
+
+    def _players(self, scenes: Sequence[Scene]) -> list[tuple[str, str]]:
+        """Who may have been tested, and how each was executed."""
+        models = [
             (model.name, execution.name)
             for model in self.models
             for execution in self._executions(Scene("cells", model.num_agents), model)
         ]
-        baselines = [("baselines", row) for row in self._names_of_baselines(scenes)]
-        for player, row in [*players, *baselines]:
-            found = [self._row(scene, player, row) for scene in scenes]
-            if not any(found):
-                continue
-            cells = [_cell(each[measure]) if each else "" for each in found]
-            yield f"| {row if player == 'baselines' else f'{player} {row}'} | " + " | ".join(cells) + " |"
-        if measure == "success_rate" and scenes[0].size == 20:
-            for trained_on, values in PAPER.items():
-                yield f"| paper, trained on {trained_on} | " + " | ".join(f"{value:.3f}" for value in values) + " |"
+        return [*models, *(("baselines", row) for row in self._names_of_baselines(scenes))]
 
     def _names_of_baselines(self, scenes: Sequence[Scene]) -> list[str]:
         for scene in scenes:
@@ -424,11 +461,17 @@ def _seconds(action: Callable[[], object], times: int = 20) -> float:
     return (time.perf_counter() - began) / times
 
 
-def _cell(estimate: dict[str, float | None]) -> str:
-    mean, low, high = (estimate[name] for name in ("mean", "low", "high"))
-    if mean is None or low is None or high is None:
+def _cell(measure: str, row: dict[str, Any]) -> str:
+    """An estimate with its 95 % interval, as a share or as a signed percentage; what has no interval as a share."""
+    found = row[measure]
+    if not isinstance(found, dict):
+        return f"{found:.3f}"
+    if found["mean"] is None:
         return "-"
-    return f"{mean:.3f} [{low:.3f}, {high:.3f}]"
+    mean, low, high = (found[name] for name in ("mean", "low", "high"))
+    if measure.startswith("flowtime"):
+        return f"{mean:+.1%} [{100 * low:+.1f}, {100 * high:+.1f}]"
+    return f"{mean:.3f} [{low:.3f}, {high:.3f}]" if measure == "success_rate" else f"{mean:.1f}"
 
 
 def main(options: Options) -> None:

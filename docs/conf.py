@@ -13,6 +13,7 @@ author = "The mapf-env authors"
 version = release = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 
 default_role = "code"
+exclude_patterns = ["paper"]  # what benchmarks/paper.py draws, included by other pages
 highlight_language = "none"  # of blocks that name no language
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 myst_heading_anchors = 3

@@ -42,10 +42,11 @@ def finish(whole, model, success: float = 0.5) -> None:
     (whole.run_of(model) / "metrics.csv").write_text("a round\n" * (1 + model.config.epochs))
     estimate = {"mean": success, "low": success - 0.1, "high": success + 0.1}
     measures = ("success_rate", "flowtime_increase", "flowtime_increase_solved", "makespan")
-    rows = [{"name": "argmax", **dict.fromkeys(measures, estimate)}]
-    path = whole._result(Scene("cells", model.num_agents), model.name)
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps({"rows": rows}))
+    folder = whole._result(Scene("cells", model.num_agents), model.name).parent
+    folder.mkdir(parents=True)
+    for player, row in ((model.name, "argmax"), ("baselines", "PIBT*")):
+        rows = [{"name": row, **dict.fromkeys(measures, estimate), "latched": 0.875}]
+        (folder / f"{player}.json").write_text(json.dumps({"cases": 90, "expert_over_bound": 1.0625, "rows": rows}))
 
 
 def test_figure_two_tests_every_k_on_its_own_size_and_figure_three_k_3_on_all(tmp_path):
@@ -100,12 +101,26 @@ def test_only_what_is_missing_is_trained_and_a_training_that_was_stopped_goes_on
 
 def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
     whole = experiment(tmp_path)
-    finish(whole, Model(12, 3), success=0.75)
+    for N in (4, 6, 8, 10, 12):
+        finish(whole, Model(N, 3), success=0.75)
     whole.draw()
     text = (tmp_path / "results.md").read_text()
-    assert "| n12-k3 argmax |  |  |  |  | 0.750 [0.650, 0.850] |  |" in text
-    assert "| paper, trained on 10 | 0.965 | 0.952 | 0.925 | 0.898 | 0.854 | 0.814 |" in text
-    assert "n4-k3" not in text
+    assert "## Cells, 20 x 20" in text
+    assert "90 cases for each number of robots" in text
+    assert "at most 1.0625 of its lower bound" in text
+    assert "| 10 |  |  |  | 0.750 [0.650, 0.850] -0.148 |  |  |" in text
+    assert "| n12-k3 argmax |  |  |  |  | 0.750 [0.650, 0.850] |" in text
+    assert "| n12-k3 argmax |  |  |  |  | +75.0% [+65.0, +85.0] |" in text
+    assert "| PIBT* | 0.875 | 0.875 | 0.875 | 0.875 | 0.875 |" in text
+    assert "| paper, trained on 10 | 0.965 | 0.952 | 0.925 | 0.898 | 0.854 |" in text
+    assert "sampled" not in text
     assert whole._heat("cells", "argmax")[4, 4] == pytest.approx(0.75)
     for picture in ("figure2-cells.png", "figure3-cells.png"):
         assert (tmp_path / picture).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_tables_of_the_docs_are_drawn_from_the_results_beside_them():
+    folder = Path(__file__).parents[2] / "docs" / "paper"
+    drawn = "\n".join(Experiment(Options(folder=folder), Console(quiet=True))._tables()) + "\n"
+    assert (folder / "results.md").read_text() == drawn
+    assert drawn.count("\n## ") >= 1
