@@ -69,6 +69,8 @@ DAGGER: Variants = {
     "stuck, every round": {"aggregation": "stuck", "dagger_steps": 32_768, "fresh_share": 0.0},
     "fresh 0.25": {"fresh_share": 0.25},
     "fresh 0.5": {"fresh_share": 0.5},
+    "mining 2": {"hard_case_mining": 2},
+    "mining 4": {"hard_case_mining": 4},
     "nodes 20": {"expert_nodes": 20},
     "beta 0.8": {"beta_decay": 0.8},
 }

@@ -92,6 +92,8 @@ class TrainConfig:
     machine ("process") or a Ray cluster ("ray") runs."""
     collectors: int = 1
     """How many of them share a process's rollout_teams; each has a seed of its own."""
+    hard_case_mining: int = 1
+    """Team steps played for each one that is labelled; teams that did not arrive in the round are labelled first."""
     shield: Shield = "idle"
     """Under which aggregated rollouts and validation play: the paper's "idle", or "pibt", which takes the logits as
     preferences."""
@@ -127,7 +129,7 @@ class TrainConfig:
         positive = (
             "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
             "expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
-            "rollout_teams collectors lr final_lr validate_every"
+            "rollout_teams hard_case_mining collectors lr final_lr validate_every"
         )
         for name in positive.split():
             if not 0 < getattr(self, name) < math.inf:

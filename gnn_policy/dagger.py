@@ -310,15 +310,20 @@ class Aggregator:
         if self._config.backend != "direct":
             self._collector.update_policy_weights_(self._mixture)
         self._collector.set_seed(seed)
-        stuck_only = self._config.aggregation == "stuck" and round_number > 0
-        cases, positions = [], []
-        for _ in range(-(-steps // (self._config.rollout_teams * self._config.rollout_length))):
+        config, demonstrated = self._config, round_number == 0
+        stuck_only = config.aggregation == "stuck" and not demonstrated
+        mining = 1 if demonstrated else config.hard_case_mining
+        seen: list[tuple[npt.NDArray[Any], ...]] = []
+        for _ in range(mining * -(-steps // (config.rollout_teams * config.rollout_length))):
             visited = next(self._batches)
-            chosen = visited["next", "truncated"].squeeze(-1) if stuck_only else slice(None)
-            cases.append(np.asarray(visited[CASE][chosen].flatten()).copy())
-            positions.append(np.asarray(visited[POSITIONS][chosen].flatten(0, -3)).copy())
+            parts = (visited[CASE], visited[POSITIONS], visited["next", "truncated"], visited["next", "terminated"])
+            seen.append(tuple(part.numpy().copy() for part in parts))
+        cases, positions, truncated, terminated = (np.concatenate(part) for part in zip(*seen, strict=True))
+        arrived = terminated.any(axis=(1, 2))
+        teams = np.sort(arrived.argsort(kind="stable")[: len(arrived) // mining])
+        asked = truncated[teams, :, 0] if stuck_only else np.ones(cases[teams].shape, np.bool_)
         ask = self._teacher.demonstrate if stuck_only else self._teacher.label
-        return ask(np.concatenate(cases), np.concatenate(positions))
+        return ask(cases[teams][asked], positions[teams][asked])
 
     def close(self) -> None:
         """Shut the collector down."""

@@ -138,7 +138,7 @@ def test_collection_plays_the_weights_of_the_moment(cases, policy):
 
 @pytest.mark.parametrize("sample", [False, True])
 def test_a_round_depends_on_seed_number_and_weights_alone(cases, policy, sample):
-    config = replace(CONFIG, sample_rollouts=sample, beta_decay=0.5)
+    config = replace(CONFIG, sample_rollouts=sample, beta_decay=0.6)
     aggregator = aggregating(config, policy, cases)
     rounds = {number: aggregator.collect(number, 100)[0] for number in (0, 1, 2)}
     aggregator.close()
@@ -233,6 +233,21 @@ def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
     assert states.cases.tolist() == [i for i in range(8) if solved[i]]
     twice, counted = teacher.label(np.tile(np.arange(8), 2), np.tile(positions, (2, 1, 1)))
     assert (len(twice), counted) == (2 * len(states), 2 * unsolved)
+
+
+def test_hard_case_mining_labels_teams_that_did_not_arrive_first(cases, policy):
+    config = replace(CONFIG, rollout_teams=8, rollout_length=12, beta_decay=0.6)
+    everything, _ = collected(config, policy, cases, 1, 3 * 8 * 12)
+    mined, _ = collected(replace(config, hard_case_mining=3), policy, cases, 1, 8 * 12)
+    assert (len(everything), len(mined)) == (288, 96)
+    arrived = (np.diff(everything.cases.reshape(24, 12), axis=1) != 0).any(axis=1)
+    assert 0 < arrived.sum() <= 16
+    paths, kept = everything.positions.reshape(24, 12, -1), mined.positions.reshape(8, 12, -1)
+    chosen = [any(np.array_equal(path, other) for other in kept) for path in paths]
+    assert sum(chosen) == 8
+    assert not np.array(chosen)[arrived].any()
+    demonstrated, _ = collected(replace(config, hard_case_mining=3), policy, cases, 0, 8 * 12)
+    assert len(demonstrated) == 96
 
 
 def test_labels_keep_the_order_of_the_visits(cases):
