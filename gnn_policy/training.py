@@ -137,6 +137,7 @@ class Training:
         ranks.share("rollout_teams", config.rollout_teams)
         self.threads = config.threads or max(cpu_threads(0) // ranks.local_count, 1)
         torch.set_num_threads(self.threads)
+        torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         torch.manual_seed(config.seed)
         self.policy = _on_device(DecentralizedPolicy(config.policy), config.device)
         self.loss = ImitationLoss(ranks.average_gradients(self.policy))

@@ -38,6 +38,18 @@ def test_a_policy_returns_as_it_was_saved(policy, file):
     assert checkpoint.about(file)["command"] == "train me"
 
 
+def test_weights_too_small_to_show_are_saved_as_zero(policy, file):
+    with torch.no_grad():
+        policy.head.weight[0, :3] = torch.tensor([1e-40, -1e-16, 1e-14])
+        expected = policy.head.weight.clone()
+        expected[0, :2] = 0
+    save(policy, file)
+    assert torch.equal(load(file).head.weight, expected)
+    for packaged in checkpoint.PACKAGED.parent.glob("*.safetensors"):
+        for name, tensor in load(packaged).state_dict().items():
+            assert not ((tensor != 0) & (tensor.abs() < 1e-15)).any(), f"{packaged.name}: {name}"
+
+
 def test_a_run_folder_stands_for_its_best_policy(policy, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"best\.safetensors"):
         load(tmp_path)
