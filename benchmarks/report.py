@@ -34,8 +34,8 @@ body{margin:0;font:15px/1.5 system-ui,sans-serif;background:#f6f7f9;color:#1f253
 main{max-width:1000px;margin:auto;padding:16px}
 h1{font-size:24px}h2{font-size:19px;margin-top:36px}
 section{display:flex;flex-wrap:wrap;gap:12px}
-section svg{flex:1 1 330px;min-width:0;max-width:100%;height:auto}
-iframe{width:100%;height:760px;border:1px solid #cbd2da;border-radius:6px;background:#fff}
+section svg{flex:1 1 330px;min-width:0;max-width:500px;height:auto}
+iframe{width:100%;height:720px;border:1px solid #cbd2da;border-radius:6px;background:#fff}
 pre{background:#fff;border:1px solid #cbd2da;padding:10px;overflow-x:auto;font-size:12px}
 """
 
@@ -156,31 +156,36 @@ def against_robots(runs: Sequence[Run]) -> str:
             flowtime.plot(*np.transpose(list(run.estimates(row, "flowtime_increase"))), marker="o")
     for size in sorted({run.trained_on for run in runs} & set(PAPER)):
         success.plot(TEAMS, PAPER[size], linestyle="--", color="black", label=f"paper, trained on {size}")
-    success.set(xlabel="robots", ylabel="success rate", ylim=(None, 1.005))
-    flowtime.set(xlabel="robots", ylabel="flowtime increase")
+    sizes = sorted({size for run in runs for row in run.rows() for size, _ in run.estimates(row, "success_rate")})
+    success.set(xlabel="robots", ylabel="success rate", ylim=(None, 1.005), xticks=sizes)
+    flowtime.set(xlabel="robots", ylabel="flowtime increase", xticks=sizes)
     legend(success)
     return side_by_side(success, flowtime)
 
 
 def heat_maps(runs: Sequence[Run]) -> str:
     """Success of the first way of execution, training teams by test teams, and the paper's."""
-    ours = {run.trained_on: dict(run.estimates(run.rows()[0], "success_rate")) for run in runs}
-    paper: dict[int, dict[int, float]] = {size: dict(zip(TEAMS, row, strict=True)) for size, row in PAPER.items()}
+    ours = {run.name: dict(run.estimates(run.rows()[0], "success_rate")) for run in sorted(runs, key=by_size)}
+    paper = {str(size): dict(zip(TEAMS, row, strict=True)) for size, row in PAPER.items()}
     columns = sorted({size for row in (*ours.values(), *paper.values()) for size in row})
-    sizes = sorted({*ours, *paper})
     return side_by_side(
-        heat_map(f"ours, {runs[0].rows()[0]}", ours, sizes, columns), heat_map("paper", paper, sizes, columns)
+        heat_map("here, first way of execution", ours, columns), heat_map("paper, trained on", paper, columns)
     )
 
 
-def heat_map(name: str, table: dict[int, dict[int, float]], sizes: Sequence[int], columns: Sequence[int]) -> Axes:
+def by_size(run: Run) -> tuple[int, str]:
+    """Runs in the order of their training teams."""
+    return run.trained_on, run.name
+
+
+def heat_map(name: str, table: dict[str, dict[int, float]], columns: Sequence[int]) -> Axes:
     """A cell for each pair of training and test teams; white where there is no number."""
     map_axes = axes()
-    values = np.array([[table.get(size, {}).get(column, np.nan) for column in columns] for size in sizes])
+    values = np.array([[row.get(column, np.nan) for column in columns] for row in table.values()])
     map_axes.imshow(values, vmin=0.3, vmax=1, cmap="viridis", aspect="auto")
-    map_axes.set(title=name, xlabel="test robots", ylabel="trained on")
+    map_axes.set(title=name, xlabel="test robots")
     map_axes.set_xticks(range(len(columns)), list(map(str, columns)))
-    map_axes.set_yticks(range(len(sizes)), list(map(str, sizes)))
+    map_axes.set_yticks(range(len(table)), list(table))
     for (i, j), value in np.ndenumerate(values):
         if not np.isnan(value):
             colour = "w" if value < 0.8 else "k"
@@ -205,7 +210,8 @@ def failure_bars(run: Run, row: str) -> Axes:
         bars.annotate(f"{total:.0f}", (size, total), ha="center", va="bottom")
     cases = sorted({table["cases"] for table in run.results.values()})
     bars.set(title=f"{run.name}, {row}", xlabel="robots", ylabel=f"failed of {'/'.join(map(str, cases))} cases")
-    bars.margins(y=0.12)
+    bars.set_ylim(0, max(1.0, 1.15 * upon.max()))
+    bars.set_xticks(sizes)
     legend(bars)
     return bars
 

@@ -17,8 +17,10 @@ from mapf_env.files import PathLike, replacing
 FORMAT = "mapf-env policy 1"
 DUST = 1e-15
 """No weight that a policy is saved with is smaller, but for zero."""
-PACKAGED = Path(__file__).with_name("weights") / "n12.safetensors"
-"""The policy that comes with the package; its card is weights/README.md."""
+WEIGHTS = Path(__file__).with_name("weights")
+"""The policies that come with the package, and their card, README.md."""
+PACKAGED = WEIGHTS / "n12.safetensors"
+"""The one that is taken where none is given."""
 
 
 class CheckpointError(ValueError):
@@ -49,12 +51,14 @@ def _without_dust(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def load(path: PathLike = PACKAGED) -> DecentralizedPolicy:
-    """The policy stored at `path`, in evaluation mode: a file, or a run folder of `gnn_policy.train`.
+    """A policy in evaluation mode.
 
-    Without a path, the policy that comes with the package.
+    Args:
+        path: A file, a run folder of `gnn_policy.train`, or the name of a policy that comes with the package: by the
+            robots of its training teams "n4", "n6", "n8", "n10", "n12", or "n12-informed", which sees the cost to go.
 
     Raises:
-        FileNotFoundError: If there is no such file.
+        FileNotFoundError: If there is none.
         CheckpointError: If the file is damaged, of another program or of another architecture.
     """
     metadata, weights = _read(path)
@@ -63,7 +67,7 @@ def load(path: PathLike = PACKAGED) -> DecentralizedPolicy:
         policy.load_state_dict(weights)
     except (KeyError, TypeError, ValueError, RuntimeError) as mismatch:
         why = " ".join(f"{type(mismatch).__name__}: {mismatch}".split())
-        raise CheckpointError(f"the weights in {_file(path)} do not fit their configuration ({why})") from None
+        raise CheckpointError(f"the weights in {file_of(path)} do not fit their configuration ({why})") from None
     return policy.eval()
 
 
@@ -80,14 +84,22 @@ def fingerprint(policy: DecentralizedPolicy) -> str:
     return hashed.hexdigest()
 
 
-def _file(path: PathLike) -> Path:
-    return Path(path, "best.safetensors") if Path(path).is_dir() else Path(path)
+def file_of(path: PathLike) -> Path:
+    """The file that `load` reads for a path or name; it need not exist."""
+    given = Path(path)
+    if given.is_dir():
+        return given / "best.safetensors"
+    packaged = WEIGHTS / f"{given}.safetensors"
+    return packaged if given.name == str(given) and not given.exists() and packaged.is_file() else given
 
 
 def _read(path: PathLike) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    file = _file(path)
+    file = file_of(path)
     if not file.is_file():
-        raise FileNotFoundError(f"there is no checkpoint {file}: give a .safetensors file or a run folder of training")
+        names = ", ".join(sorted(each.stem for each in WEIGHTS.glob("*.safetensors")))
+        raise FileNotFoundError(
+            f"there is no checkpoint {file}: give a .safetensors file, a run folder of training, or one of {names}"
+        )
     try:
         with safetensors.safe_open(file, "pt") as stored:
             metadata: dict[str, str] = stored.metadata() or {}

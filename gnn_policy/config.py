@@ -222,6 +222,7 @@ RECIPES: dict[Recipe, TrainConfig] = {
     "quick": _QUICK,
     "full": replace(
         _QUICK,
+        num_agents=12,
         styles=("cells", "walls"),
         train_maps=4000,
         cases_per_map=20,
@@ -232,5 +233,5 @@ RECIPES: dict[Recipe, TrainConfig] = {
     ),
     "paper": TrainConfig(),
 }
-"""Complete sets of settings: one that takes about ten minutes on two CPU cores, that of the policies that come with the
+"""Complete sets of settings: one that takes about ten minutes on two CPU cores, that of the policy that comes with the
 package, and the paper's."""

@@ -28,7 +28,7 @@ class Command:
     """
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = checkpoint.PACKAGED
-    """A run folder of training, or a .safetensors file; the policy that comes with the package if not given."""
+    """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     num_agents: tuple[int, ...] = ()
     """Team sizes N, one table for each."""
     rows: tuple[str, ...] | None = None
@@ -102,9 +102,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _home(run: Path) -> Path:
-    if run == checkpoint.PACKAGED:
-        return Path()
-    return run if run.is_dir() else run.parent
+    folder = checkpoint.file_of(run).parent
+    return Path() if folder == checkpoint.WEIGHTS else folder
 
 
 def _trained_with(run: Path) -> TrainConfig:

@@ -34,7 +34,7 @@ class Command:
     agents: int | None = None
     """How many robots: placed at random on a map, else the first ones of the file (all of them if not given)."""
     run: Path = checkpoint.PACKAGED
-    """A run folder of training, or a .safetensors file; the policy that comes with the package if not given."""
+    """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     map: Path | None = None
     """The map of a scenario, if it does not lie beside it."""
     index: int | None = None

@@ -45,7 +45,7 @@ def test_weights_too_small_to_show_are_saved_as_zero(policy, file):
         expected[0, :2] = 0
     save(policy, file)
     assert torch.equal(load(file).head.weight, expected)
-    for packaged in checkpoint.PACKAGED.parent.glob("*.safetensors"):
+    for packaged in checkpoint.WEIGHTS.glob("*.safetensors"):
         for name, tensor in load(packaged).state_dict().items():
             assert not ((tensor != 0) & (tensor.abs() < 1e-15)).any(), f"{packaged.name}: {name}"
 
@@ -55,6 +55,18 @@ def test_a_run_folder_stands_for_its_best_policy(policy, tmp_path):
         load(tmp_path)
     save(policy, str(tmp_path / "best.safetensors"))
     assert load(str(tmp_path)).config == CONFIG
+
+
+def test_a_policy_of_the_package_is_loaded_by_its_name_unless_there_is_such_a_file(policy, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for packaged in checkpoint.WEIGHTS.glob("*.safetensors"):
+        by_name, by_path = load(packaged.stem), load(packaged)
+        assert checkpoint.fingerprint(by_name) == checkpoint.fingerprint(by_path)
+    save(policy, "n10")
+    assert load("n10").config == CONFIG
+    for missing in ("n11", f"../{checkpoint.WEIGHTS.name}/n12"):
+        with pytest.raises(FileNotFoundError, match="one of n10, n12, n12-informed, n4, n6, n8"):
+            load(missing)
 
 
 def test_other_users_may_read_what_the_umask_lets_them(file):
