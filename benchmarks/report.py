@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import date
 from html import escape
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import numpy as np
 import tyro
@@ -38,6 +38,16 @@ section svg{flex:1 1 330px;min-width:0;max-width:500px;height:auto}
 iframe{width:100%;height:720px;border:1px solid #cbd2da;border-radius:6px;background:#fff}
 pre{background:#fff;border:1px solid #cbd2da;padding:10px;overflow-x:auto;font-size:12px}
 """
+
+
+KINDS: dict[Failure, str] = {
+    "out of time": "nobody is stalled; with more steps the team might have done it",
+    "goal blocked": "robots that rest on their own goals cut off a stalled robot from its own",
+    "deadlock": "the stalled robots stand still",
+    "oscillation": "each stalled robot stays on at most two cells, some going to and fro",
+    "livelock": "the stalled robots move about and get nowhere",
+}
+"""As gnn_policy.failures tells them apart."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +73,8 @@ class Run:
     """A row for each round."""
     results: dict[str, Any]
     """Tables by the number of robots; empty if the run was not examined."""
+    exam: str
+    """What the tables were measured on."""
     failures: str | None
     """The page of the worst cases."""
 
@@ -78,14 +90,15 @@ class Run:
         metrics = folder / "metrics.csv"
         home = next((each for each in (folder / "evaluation", folder) if (each / "results.json").is_file()), None)
         page = (home or folder) / "failures.html"
-        results = json.loads((home / "results.json").read_text(encoding="utf-8"))["num_agents"] if home else {}
+        found = json.loads((home / "results.json").read_text(encoding="utf-8")) if home else {}
         tests = {N: folder.parent / f"results/20x20-cells-n{N}/{folder.name}.json" for N in TEAMS}
         tested = {str(N): json.loads(file.read_text(encoding="utf-8")) for N, file in tests.items() if file.is_file()}
         return Run(
             folder.name,
             json.loads((folder / "config.json").read_text(encoding="utf-8"))["num_agents"],
             list(csv.DictReader(io.StringIO(metrics.read_text(encoding="utf-8")))) if metrics.is_file() else [],
-            tested or results,
+            tested or found.get("num_agents", {}),
+            "benchmarks/paper.py: test maps of independent cells, w = 1.05" if tested else _exam(found.get("settings")),
             page.read_text(encoding="utf-8") if page.is_file() else None,
         )
 
@@ -99,6 +112,14 @@ class Run:
             for found in table["rows"]:
                 if found["name"].removesuffix(",cost-to-go*") == row and found[measure]["mean"] is not None:
                     yield int(size), found[measure]["mean"]
+
+
+def _exam(settings: dict[str, Any] | None) -> str:
+    if not settings:
+        return "not examined"
+    maps = "{maps} {split} maps of {styles}, {height} x {width}, {cases_per_map} cases each, "
+    styles = " and ".join(settings["styles"])
+    return (maps + "w = {w}, T_max {timeout} makespans").format(**{**settings, "styles": styles})
 
 
 def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
@@ -117,14 +138,27 @@ def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
     if any(run.metrics for run in runs):
         parts += ["<h2>Learning curves</h2>", curves([run for run in runs if run.metrics])]
     examined = [run for run in runs if run.results]
+    parts += [
+        f"<p>{escape(run.name)} is not examined yet: <code>python -m gnn_policy.evaluate RUN --num-agents 4 6 8 10 12 14 "
+        "--failures 5</code> does it.</p>"
+        for run in runs
+        if not run.results
+    ]
     if examined:
+        exams = {run.exam: ", ".join(each.name for each in examined if each.exam == run.exam) for run in examined}
+        parts += [
+            "<h2>What was examined</h2>",
+            *(f"<p>{escape(who)}: {escape(exam)}</p>" for exam, who in exams.items()),
+        ]
         parts += ["<h2>Success and flowtime against the number of robots</h2>", against_robots(examined)]
         parts += ["<h2>Success beside the paper's</h2>", heat_maps(examined)]
-        parts += ["<h2>Why teams failed</h2>", failures(examined)]
+        kinds = "".join(f"<li><b>{kind}</b>: {meaning}</li>" for kind, meaning in KINDS.items())
+        parts += ["<h2>Why teams failed</h2>", f"<ul>{kinds}</ul>", failures(examined)]
     for run in examined:
         if run.failures is not None:
             parts.append(
-                f'<h3>{escape(run.name)}</h3><iframe title="replays" srcdoc="{escape(run.failures)}"></iframe>'
+                f"<h3>{escape(run.name)}: the worst of each kind, by python -m gnn_policy.evaluate</h3>"
+                f'<iframe title="replays" srcdoc="{escape(run.failures)}"></iframe>'
             )
     if speed:
         parts.append("<h2>Speed</h2>")
@@ -202,7 +236,7 @@ def failure_bars(run: Run, row: str) -> Axes:
     """Failed cases by the number of robots, the kinds upon one another."""
     bars = axes()
     sizes, upon = list(run.results), np.zeros(len(run.results))
-    for kind in get_args(Failure):
+    for kind in KINDS:
         found = np.array([table["failures"][row].get(kind, 0) for table in run.results.values()])
         bars.bar(sizes, found, bottom=upon, label=kind)
         upon += found

@@ -40,7 +40,9 @@ def run(tmp_path: Path) -> Path:
         }
         for size in (4, 10)
     }
-    (folder / "evaluation" / "results.json").write_text(json.dumps({"settings": {}, "num_agents": tables}))
+    settings = {"maps": 3, "split": "test", "styles": ["cells", "walls"], "height": 20, "width": 20}
+    settings |= {"cases_per_map": 30, "w": 1.1, "timeout": 3.0}
+    (folder / "evaluation" / "results.json").write_text(json.dumps({"settings": settings, "num_agents": tables}))
     (folder / "evaluation" / "failures.html").write_text("<!doctype html><p>\"worst\" & 'cases'</p>")
     return folder
 
@@ -61,6 +63,7 @@ def test_the_page_has_curves_tables_replays_and_speed(run: Path, tmp_path: Path)
     (replays,) = re.findall('srcdoc="([^"]*)"', page)
     assert unescape(replays) == "<!doctype html><p>\"worst\" & 'cases'</p>"
     assert "9 million &lt;steps&gt;" in page
+    assert "3 test maps of cells and walls, 20 x 20, 30 cases each, w = 1.1, T_max 3.0 makespans" in page
     assert not re.findall(r'(?:src|href)="(?!#|data:)', page), "the page fetches something"
 
 
@@ -83,6 +86,7 @@ def test_a_run_that_was_not_examined_has_its_curves(run: Path, tmp_path: Path) -
     (run / "evaluation" / "results.json").unlink()
     assert report(run, "--out", "other.html", folder=tmp_path).returncode == 0
     assert (tmp_path / "other.html").read_text(encoding="utf-8").count("<svg") == 2
+    assert "python -m gnn_policy.evaluate RUN" in (tmp_path / "other.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("arguments", "words"), [(["none"], "none is no run folder"), ([], "at least one run")])
