@@ -139,8 +139,8 @@ def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
         parts += ["<h2>Learning curves</h2>", curves([run for run in runs if run.metrics])]
     examined = [run for run in runs if run.results]
     parts += [
-        f"<p>{escape(run.name)} is not examined yet: <code>python -m gnn_policy.evaluate RUN --num-agents 4 6 8 10 12 14 "
-        "--failures 5</code> does it.</p>"
+        f"<p>{escape(run.name)} is not examined yet; <code>python -m gnn_policy.evaluate RUN --num-agents 4 6 8 10 12 "
+        "14 --failures 5</code> does it.</p>"
         for run in runs
         if not run.results
     ]

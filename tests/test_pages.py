@@ -106,6 +106,25 @@ def test_the_code_blocks_run_one_after_another(
         assert (tmp_path / "runs" / "look" / "evaluation" / "failures.html").is_file()
 
 
+COMMAND = re.compile(r"`(python (?:-m [\w.]+|benchmarks/\w+\.py)(?:\s[^`]*)?)`")
+
+
+@pytest.mark.parametrize("page", [*PAGES, "gnn_policy/weights/README.md"])
+def test_commands_in_the_text_name_scripts_and_options_that_exist(page: str) -> None:
+    """An option stands in the script's own text, or in that of the settings it takes."""
+    for line in COMMAND.findall((ROOT / page).read_text(encoding="utf-8")):
+        words = shlex.split(line)
+        script, *options = words[1:] if words[1] != "-m" else [words[2].replace(".", "/") + ".py", *words[3:]]
+        if not (ROOT / script).is_file():
+            script = f"{script.removesuffix('.py')}/command.py"
+        sources = [ROOT / script, ROOT / "gnn_policy" / "config.py", ROOT / "gnn_policy" / "network.py"]
+        text = "".join(source.read_text(encoding="utf-8") for source in sources)
+        for option in options:
+            if option.startswith("--") and option != "--help":
+                name = option[2:].split("=")[0].rpartition(".")[2].removeprefix("no-")
+                assert f'"--{name}"' in text or re.search(rf"\b{name.replace('-', '_')}\b", text), f"{line!r}: {option}"
+
+
 @pytest.mark.parametrize("page", sorted(page.stem for page in (ROOT / "docs" / "frameworks").glob("*.md")))
 def test_a_frameworks_page_runs_where_its_packages_are(page: str, tmp_path: Path) -> None:
     code = "\n".join(text for language, text in blocks(f"docs/frameworks/{page}.md") if language == "python")
