@@ -85,7 +85,7 @@ class Robot:
         """Start a step.
 
         Args:
-            view: (C, F, F) what it sees, as `mapf_env` shows it.
+            view: (C, S, S) what it sees, as `mapf_env` shows it.
             links: The weights of the links to the neighbours that it hears, by whatever names they have: 1, or 1 /
                 distance for a policy whose comm_weights are "distance".
             cell: Where it stands, in any frame that stays the same, as its odometry's.

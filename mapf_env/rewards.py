@@ -42,9 +42,9 @@ SCHEMES: dict[str, Rewards] = {
 }
 """Schemes by name.
 
-flowtime: -1 for each step off the goal; the return is the negated flowtime but for a constant.
-shaped: the same plus what the robot came closer, a potential that changes no optimal policy (Ng, Harada and Russell
-1999).
-arrival: 1 for each arrival; in lifelong tasks the return is the throughput.
-solved: 1 for every robot when the whole team is on its goals, and nothing else.
+- flowtime: -1 for each step off the goal; the return is the negated flowtime but for a constant.
+- shaped: the same plus what the robot came closer, the change of a potential (Ng, Harada and Russell 1999). It changes
+  no optimal policy without discounting, in one-shot tasks that end before max_cycles.
+- arrival: 1 for each arrival; in lifelong tasks the return is the throughput.
+- solved: 1 for every robot when the whole team is on its goals, and nothing else.
 """

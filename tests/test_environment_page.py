@@ -1,19 +1,34 @@
-"""The table of settings in docs/environment.md is complete."""
+"""The tables of settings in docs/environment.md are complete."""
 
+import inspect
 import re
 from dataclasses import fields
 from pathlib import Path
 
-from mapf_env import EnvConfig
+from mapf_env import BatchedEnv, EnvConfig, GridEnv
 
 PAGE = (Path(__file__).parents[1] / "docs" / "environment.md").read_text(encoding="utf-8")
+SHARED, OF_ONE_INTERFACE = PAGE.split("## Settings")[1].split("### Of one interface alone")
+
+
+def listed(part: str) -> dict[str, str]:
+    """The names in the tables of a part of the page, and their defaults."""
+    found: dict[str, str] = {}
+    for names, defaults in re.findall(r"^\| (`\w+`(?:, `\w+`)*) \| ([^|]+) \|", part, re.MULTILINE):
+        shown = [default.strip("` ").strip('"') for default in defaults.split(",")]
+        found |= dict(zip(re.findall(r"\w+", names), shown, strict=True))
+    return found
 
 
 def test_every_setting_is_listed_with_its_default() -> None:
-    listed: dict[str, str] = {}
-    for names, defaults in re.findall(
-        r"^\| (`\w+`(?:, `\w+`)*) \| ([^|]+) \|", PAGE.split("## Settings")[1], re.MULTILINE
-    ):
-        shown = [default.strip("` ").strip('"') for default in defaults.split(",")]
-        listed |= dict(zip(re.findall(r"\w+", names), shown, strict=True))
-    assert listed == {field.name: str(field.default) for field in fields(EnvConfig)}
+    assert listed(SHARED) == {field.name: str(field.default) for field in fields(EnvConfig)}
+
+
+def test_what_one_interface_alone_takes_is_listed_with_its_default() -> None:
+    taken = {
+        name: getattr(parameter.default, "name", str(parameter.default))
+        for interface in (GridEnv, BatchedEnv)
+        for name, parameter in inspect.signature(interface).parameters.items()
+        if parameter.default is not parameter.empty
+    }
+    assert listed(OF_ONE_INTERFACE) == taken

@@ -7,6 +7,7 @@ where its packages are, and is skipped elsewhere; `pytest tests/test_pages.py -k
 """
 
 import ast
+import importlib
 import importlib.util
 import os
 import re
@@ -16,9 +17,13 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
+import experts
+import gnn_policy
+import mapf_env
 from experts import command as experts_command
 from gnn_policy import evaluate, play, train
 from mapf_env import random_instance, save_instances, save_map, save_scen
@@ -138,6 +143,19 @@ def test_a_frameworks_page_runs_where_its_packages_are(page: str, tmp_path: Path
     )
     assert done.returncode == 0, done.stderr[-3000:]
     print(done.stdout)
+
+
+@pytest.mark.parametrize("package", [mapf_env, experts, gnn_policy], ids=lambda package: package.__name__)
+def test_the_reference_has_every_public_name(package: ModuleType) -> None:
+    page = (ROOT / "docs" / "reference" / f"{package.__name__}.md").read_text(encoding="utf-8")
+    documented: list[object] = []
+    for module, name in re.findall(r"^\.\. auto(?:class|data|function):: ([\w.]+)\.(\w+)", page, re.M):
+        documented.append(getattr(importlib.import_module(module), name))
+    for module in re.findall(r"^\.\. automodule:: ([\w.]+)\n(?!   :no-members:)", page, re.M):
+        values = vars(importlib.import_module(module)).values()
+        documented += [each for each in values if getattr(each, "__module__", "") == module]
+    missing = [name for name in package.__all__ if not any(getattr(package, name) is each for each in documented)]
+    assert not missing
 
 
 def imported(code: str) -> set[str]:
