@@ -35,7 +35,7 @@ from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
-from gnn_policy.precision import autocast
+from gnn_policy.precision import Precision, autocast
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.rollout import rollout
 from gnn_policy.training import Training, split_cases
@@ -84,6 +84,8 @@ class Options:
     """Test cases on each of 90 maps."""
     large: bool = True
     """Test the model of the largest training team on maps of 50x50 as well, where teams have 20, 40 and 60."""
+    precision: Precision = "auto"
+    """In which numbers the policies compute in the tests, as in gnn_policy.train."""
     threads: int = 1
     """CPU threads of training, testing and the expert."""
 
@@ -276,7 +278,8 @@ class Experiment:
         """A row for each way to execute the model, and how its teams failed."""
         policy, rows, failures = checkpoint.load(self.run_of(model)), [], {}
         for execution in self._executions(scene, model):
-            played = rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(execution))
+            with autocast(self.options.precision, torch.device("cpu")):
+                played = rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(execution))
             rows.append(evaluation.score(execution.name, exam, played))
             failures[execution.name] = count_failures(played)
         return rows, failures

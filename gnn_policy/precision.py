@@ -1,4 +1,4 @@
-"""In which numbers a network computes while it is trained; its weights and everything else are float32 always."""
+"""In which numbers a network computes; its weights and everything else are float32 always."""
 
 from __future__ import annotations
 
