@@ -306,7 +306,7 @@ class Experiment:
         policy = DecentralizedPolicy(model.config.policy).eval()
         fov = torch.zeros(64, scene.num_agents, model.config.policy.channels, 11, 11)
         graph = torch.zeros(64, scene.num_agents, scene.num_agents)
-        with torch.inference_mode():
+        with torch.inference_mode(), autocast(self.options.precision, fov.device):
             each = _seconds(lambda: policy(fov, graph), times=2) / 64
         cases = model.config.test_maps * self.options.cases_per_map
         return 1.25 * each * cases * STEPS[scene.size] * len(self._executions(scene, model))
