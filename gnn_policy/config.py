@@ -18,7 +18,7 @@ from mapf_env.generation import MapStyle
 Recipe = Literal["quick", "full", "paper"]
 RobotOrder = Literal["index", "random", "farthest", "nearest"]
 Aggregation = Literal["visited", "stuck"]
-Backend = Literal["direct", "process", "ray"]
+Backend = Literal["direct", "process"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,8 +88,7 @@ class TrainConfig:
     rollout_teams: int = 128
     """Teams that play side by side."""
     backend: Backend = "direct"
-    """Where TorchRL's collector plays: in this process, or in as many others as there are `collectors`, which this
-    machine ("process") or a Ray cluster ("ray") runs."""
+    """Where TorchRL's collector plays: "direct" in this process, or "process", in as many others as `collectors`."""
     collectors: int = 1
     """How many of them share a process's rollout_teams; each has a seed of its own."""
     hard_case_mining: int = 1
@@ -153,7 +152,7 @@ class TrainConfig:
             if getattr(self, name) >= 2**64:
                 raise ValueError(f"{name} must be below 2**64, got {getattr(self, name)}")
         if self.backend == "direct" and self.collectors > 1:
-            raise ValueError(f'{self.collectors} collectors need processes: backend "process" or "ray"')
+            raise ValueError(f'{self.collectors} collectors need processes of their own: backend "process"')
         if not 1 <= self.w < math.inf:
             raise ValueError(f"w must be at least 1 and finite, got {self.w}")
         if self.updates_per_epoch is not None and self.updates_per_epoch < 1:

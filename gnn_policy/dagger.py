@@ -8,7 +8,6 @@ that of the paper's released code.
 from __future__ import annotations
 
 import functools
-import importlib.util
 import math
 import pkgutil
 import time
@@ -245,14 +244,9 @@ def _collector(
     own: dict[str, Any] = {"compact_obs": True, "auto_register_policy_transforms": False}
     if backend == "direct":
         return Collector(make_env(), mixture, backend=backend, **settings, **own)
+    torch.multiprocessing.set_sharing_strategy("file_system")  # open files cannot be passed to spawned processes
     settings |= {"num_collectors": players, "sync": True}
-    if backend == "process":  # passing open files to spawned processes fails for shared storages
-        torch.multiprocessing.set_sharing_strategy("file_system")
-        return Collector([make_env] * players, mixture, backend=backend, **settings, **own)
-    if importlib.util.find_spec("ray") is None:
-        raise ValueError('backend "ray" needs Ray: pip install ray, or choose "process"')
-    options = {"collector_kwargs": own, "remote_configs": {"num_cpus": 1, "num_gpus": 0}}
-    return Collector([make_env] * players, mixture, backend=backend, backend_options=options, **settings)
+    return Collector([make_env] * players, mixture, backend=backend, **settings, **own)
 
 
 class Aggregator:
