@@ -6,7 +6,17 @@ import math
 
 from mapf_env.arguments import MOST_THREADS, cells, each_of, instance_of, integer, number, seed
 
-__all__ = ["MOST_THREADS", "at_least_one", "cells", "each_of", "instance_of", "seconds", "seed", "suboptimality"]
+__all__ = [
+    "MOST_THREADS",
+    "at_least_one",
+    "cells",
+    "each_of",
+    "improvement",
+    "instance_of",
+    "seconds",
+    "seed",
+    "suboptimality",
+]
 
 DEFAULT_W = 1.05
 DEFAULT_TIME_LIMIT = 10.0
@@ -25,6 +35,12 @@ def suboptimality(w: float) -> float:
     if not (math.isfinite(value) and value >= 1):
         raise ValueError(f"w must be a finite number >= 1 (1 is optimal, 1.05 allows 5% above the optimum), got {w!r}")
     return value
+
+
+def improvement(w: float) -> float:
+    """LaCAM's factor `w`: as `suboptimality`, or `math.inf` for the first plan as it is."""
+    value = number(w, "w")
+    return value if value == math.inf else suboptimality(value)
 
 
 def seconds(time_limit: float) -> float:

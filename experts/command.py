@@ -52,8 +52,8 @@ def _parser() -> _Parser:
     solve.add_argument(
         "--w",
         type=float,
-        default=arguments.DEFAULT_W,
-        help=f"of ecbs: how much the cost may exceed the optimum, at least 1 (default: {arguments.DEFAULT_W})",
+        help="of ecbs: how much the cost may exceed the optimum, at least 1 "
+        f"(default: {arguments.DEFAULT_W}); of lacam: where improvement stops (default: its first plan)",
     )
     solve.add_argument(
         "--time-limit",

@@ -44,7 +44,7 @@ def lacam(
         instance.grid,
         instance.starts,
         instance.goals,
-        w if w == math.inf else arguments.suboptimality(w),
+        arguments.improvement(w),
         arguments.seconds(time_limit),
         arguments.at_least_one(node_limit, "node_limit"),
         arguments.seed(seed),

@@ -29,7 +29,7 @@ def solve_many(
     instances: Iterable[Instance],
     *,
     solver: str | Solver = "ecbs",
-    w: float = arguments.DEFAULT_W,
+    w: float | None = None,
     threads: int = 1,
     time_limit: float = arguments.DEFAULT_TIME_LIMIT,
     node_limit: int = arguments.DEFAULT_NODE_LIMIT,
@@ -45,7 +45,7 @@ def solve_many(
         instances: The problems.
         solver: `"ecbs"`, `"lacam"`, `"prioritised"`, `"pibt"`, or a function of an instance, as `functools.partial`
             makes one that fixes more options.
-        w: As in `solve`; `"ecbs"` alone takes it.
+        w: As in `solve` for `"ecbs"` and as in `lacam` for `"lacam"`, with the default of each; others have none.
         threads: Native solvers do not hold Python's interpreter lock. A function runs in a pool of threads, or in the
             calling thread if there is one only.
         time_limit: Seconds for each instance, where a named solver takes a limit.
@@ -57,7 +57,7 @@ def solve_many(
         One result for each instance, in their order; unsolved ones say why.
 
     Raises:
-        ValueError: If an argument is out of its range.
+        ValueError: If an argument is out of its range, or the solver has no `w` and one is given.
         TypeError: If an argument has the wrong type, an element of `instances` is no `Instance`, or a solver's answer
             no `Result`.
         KeyboardInterrupt: At Ctrl-C, which stops ECBS at once; of other solvers those that are running finish first.
@@ -82,7 +82,7 @@ def solve_stream(
     instances: Iterable[Instance],
     *,
     solver: str | Solver = "ecbs",
-    w: float = arguments.DEFAULT_W,
+    w: float | None = None,
     threads: int = 1,
     time_limit: float = arguments.DEFAULT_TIME_LIMIT,
     node_limit: int = arguments.DEFAULT_NODE_LIMIT,
@@ -118,30 +118,40 @@ def solve_stream(
         "node_limit": arguments.at_least_one(node_limit, "node_limit"),
         "seed": arguments.seed(seed),
     }
-    arguments.suboptimality(w)
     threads = arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS)
     backlog = arguments.at_least_one(backlog, "backlog")
     problems = arguments.each_of(instances, Instance, "instances")
     if progress is not None and not callable(progress):
         raise TypeError(f"progress must be a function of two numbers, got {progress!r}")
     if solver == "ecbs":
-        batch = partial(solve_batch, w=w, threads=threads, **limits)
+        factor = arguments.DEFAULT_W if w is None else arguments.suboptimality(w)
+        batch = partial(solve_batch, w=factor, threads=threads, **limits)
         results = _in_batches(problems, batch, backlog)
     else:
         single = solver_named(solver, w=w, **limits) if isinstance(solver, str) else solver
         if not callable(single):
             raise TypeError(f"solver must be one of {', '.join(SOLVER_NAMES)} or a function, got {solver!r}")
+        if w is not None and single is solver:
+            raise ValueError("w is an option of named solvers: fix that of a function by functools.partial")
         results = _in_pool(problems, single, threads, backlog)
     return results if progress is None else _reporting(results, progress)
 
 
-def solver_named(name: str, *, w: float, time_limit: float, node_limit: int, seed: int) -> Solver:
-    """The solver of that name with the options it takes; raises ValueError if there is none."""
+def solver_named(name: str, *, w: float | None, time_limit: float, node_limit: int, seed: int) -> Solver:
+    """The solver of that name with the limits it takes, and `w` if that is given.
+
+    Raises:
+        ValueError: If there is no such solver, or it has no `w` and one is given.
+    """
     match name:
         case "ecbs":
-            return partial(solve, w=w, time_limit=time_limit, node_limit=node_limit, seed=seed)
+            factor = {} if w is None else {"w": arguments.suboptimality(w)}
+            return partial(solve, **factor, time_limit=time_limit, node_limit=node_limit, seed=seed)
         case "lacam":
-            return partial(lacam, time_limit=time_limit, node_limit=node_limit, seed=seed)
+            factor = {} if w is None else {"w": arguments.improvement(w)}
+            return partial(lacam, **factor, time_limit=time_limit, node_limit=node_limit, seed=seed)
+        case "prioritised" | "pibt" if w is not None:
+            raise ValueError(f"the solver {name!r} has no w: leave it out, or choose ecbs or lacam")
         case "prioritised":
             return partial(prioritised, time_limit=time_limit, seed=seed)
         case "pibt":

@@ -55,7 +55,8 @@ class TrainConfig:
     teacher: str = "ecbs"
     """Who shows the moves: "ecbs", "lacam", "prioritised", "pibt", or a solver of your own as "module:function"."""
     w: float = 1.05
-    """ECBS's cost is at most w times the lower bound of the optimum; its plans also set T_max."""
+    """ECBS's cost is at most w times the lower bound of the optimum, where it teaches and where its plans set T_max;
+    other teachers are asked without a w."""
     robot_order: RobotOrder = "index"
     """The order in which the teacher is given the robots of a state, by which solvers break ties: that of their
     numbers, "random" in each state, or by the Manhattan distance to their goals, "farthest" or "nearest" first."""

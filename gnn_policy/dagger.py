@@ -39,7 +39,7 @@ class Teacher:
     Args:
         instances: The training cases.
         solver: The expert: one of the solvers that `experts.solve_many` knows by name, or "module:function".
-        w: ECBS's bound on suboptimality.
+        w: ECBS's bound on suboptimality; other solvers are asked without one.
         robot_order: In which order it is given the robots of a state; it breaks ties by that.
         node_limit: ECBS's and LaCAM's effort for a state.
         threads: CPU threads.
@@ -97,7 +97,7 @@ class Teacher:
         results = experts.solve_many(
             self._ordered(cases, positions, order),
             solver=self._solver,
-            w=self._w,
+            w=self._w if self._solver == "ecbs" else None,
             threads=self._threads,
             time_limit=math.inf,
             node_limit=self._node_limit,

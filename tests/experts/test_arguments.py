@@ -36,7 +36,7 @@ FACTOR = (*NUMBER, 0.9)
 MANY = LIMITS | {
     "instances": (*SEVERAL, INSTANCE),
     "solver": (*STRING, "a"),
-    "w": (*FACTOR, float("inf")),
+    "w": (*but(FACTOR, NoneType), float("inf")),
     "threads": (*COUNT, 1025),
     "progress": but(OBJECT, NoneType),
 }

@@ -7,7 +7,7 @@ import pytest
 
 import experts
 from experts.command import main
-from mapf_env import Instance, Solution, random_instance, save_instances, save_map, save_scen
+from mapf_env import Instance, Solution, load_scen, random_instance, save_instances, save_map, save_scen
 
 
 @pytest.fixture
@@ -30,6 +30,22 @@ def test_solve_then_check(scen: Path, solver: str, capsys: pytest.CaptureFixture
     assert picture.read_text().startswith("<svg")
     assert main(["check", str(paths), "--scen", str(scen)]) == 0
     assert capsys.readouterr().out.startswith("valid: 6 robots")
+
+
+def test_w_is_that_of_the_solver(scen: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for solver in ("ecbs", "lacam"):
+        for given in ([], ["--w", "1.1"]):
+            assert main(["solve", str(scen), "--solver", solver, *given]) == 0
+    costs = [line.split()[1] for line in capsys.readouterr().out.splitlines() if line.startswith("cost")]
+    instance = load_scen(scen)
+    alone = [
+        experts.solve(instance),
+        experts.solve(instance, w=1.1),
+        experts.lacam(instance),
+        experts.lacam(instance, w=1.1),
+    ]
+    assert costs == [str(each.cost) for each in alone]
+    assert costs[2] != costs[3]
 
 
 def test_some_robots_of_a_scenario_and_random_ones_on_a_map(scen: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,6 +108,8 @@ def test_no_plan_is_status_1(scen: Path, capsys: pytest.CaptureFixture[str]) -> 
     [
         (["solve", "nowhere.scen"], "nowhere.scen"),
         (["solve", "{scen}", "--w", "0.5"], "w must be a finite number"),
+        (["solve", "{scen}", "--solver", "lacam", "--w", "0.5"], "w must be a finite number"),
+        (["solve", "{scen}", "--solver", "pibt", "--w", "1"], "the solver 'pibt' has no w"),
         (["solve", "{scen}", "--agents", "99"], "99 agents asked for"),
         (["solve", "{map}"], "give --agents N"),
         (["solve", "{scen}", "--index", "1"], "--index goes with a set of instances"),

@@ -1,3 +1,4 @@
+import math
 from collections.abc import Iterator
 from functools import partial
 
@@ -48,6 +49,28 @@ def test_solvers_of_all_kinds(threads: int) -> None:
         expected = costs([alone(instance) for instance in INSTANCES])
         assert costs(experts.solve_many(INSTANCES, solver=name, threads=threads)) == expected
         assert costs(experts.solve_many(INSTANCES, solver=alone, threads=threads)) == expected
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_w_reaches_the_solvers_that_have_one(threads: int) -> None:
+    assert len({tuple(costs([experts.lacam(each, w=w) for each in INSTANCES])) for w in (1.05, math.inf)}) == 2
+    for name, alone in (("ecbs", experts.solve), ("lacam", experts.lacam)):
+        for w in (1.05, 1.3):
+            expected = costs([alone(instance, w=w) for instance in INSTANCES])
+            assert costs(experts.solve_many(INSTANCES, solver=name, w=w, threads=threads)) == expected
+    first = costs([experts.lacam(instance) for instance in INSTANCES])
+    assert costs(experts.solve_many(INSTANCES, solver="lacam", w=math.inf, threads=threads)) == first
+
+
+def test_solvers_without_a_w_refuse_one() -> None:
+    for name in ("prioritised", "pibt"):
+        with pytest.raises(ValueError, match=f"the solver '{name}' has no w"):
+            experts.solve_stream(INSTANCES, solver=name, w=1.05)
+    with pytest.raises(ValueError, match=r"w is an option of named solvers: .* functools.partial"):
+        experts.solve_stream(INSTANCES, solver=experts.lacam, w=1.05)
+    for name in ("ecbs", "lacam"):
+        with pytest.raises(ValueError, match="w must be"):
+            experts.solve_stream(INSTANCES, solver=name, w=0.9)
 
 
 def test_a_solver_of_your_own() -> None:
