@@ -28,7 +28,8 @@ def solve(
         instance: The problem; `instance.at(positions)` asks from any later state.
         w: The suboptimality factor, at least 1: `cost <= w * lower_bound` holds for every solved result.
         time_limit: Seconds of wall-clock time, `math.inf` for none.
-        node_limit: High-level nodes to generate at most; this bounds the memory (about 100 bytes a node on 20x20).
+        node_limit: High-level nodes to generate at most; this bounds the memory (about 160 bytes a node on 20x20, up to
+            twice that while arrays grow).
         seed: Shuffles the order in which the first joint plan treats the robots.
 
     Returns:
