@@ -37,8 +37,8 @@ class TrainConfig:
     density: float = 0.1
     """Share of obstacles on a map."""
     styles: tuple[MapStyle, ...] = ("cells",)
-    """Obstacles: independent "cells", or short "walls" as the paper's released generator makes them; the maps of a
-    split take turns among the styles."""
+    """Obstacles: independent "cells", short "walls" as the paper's released generator makes them, or "maze", "room",
+    "warehouse" and "empty", which heed no density; the maps of a split take turns among the styles."""
     train_maps: int = 420
     """Maps for training."""
     validation_maps: int = 90

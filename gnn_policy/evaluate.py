@@ -49,7 +49,8 @@ class Command:
     density: float | None = None
     """Share of obstacles."""
     styles: tuple[MapStyle, ...] | None = None
-    """Obstacles as independent "cells" or short "walls"."""
+    """Obstacles: independent "cells", short "walls", or "maze", "room", "warehouse" and "empty", which heed no
+    density; the maps take turns among the styles."""
     data_seed: int | None = None
     """Of the maps and cases; any seed gives maps that training with it does not use."""
     w: float | None = None
