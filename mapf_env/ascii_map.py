@@ -11,10 +11,12 @@ from mapf_env.instance import Instance, Obstacles
 
 
 def parse_map(drawing: str) -> Obstacles:
-    """The grid (H, W) of a drawing: `#` or `@` is an obstacle, everything else free; blank lines around it are cut.
+    """The grid (H, W) of a drawing: `#` or `@` is an obstacle, `.` or a letter a free cell.
+
+    Blank lines around the drawing and spaces at the ends of its lines are cut.
 
     Raises:
-        ValueError: If there are no cells, or the lines differ in length.
+        ValueError: If there are no cells, the lines differ in length, or a cell is another character.
     """
     return np.isin(_characters(drawing), ["#", "@"])
 
