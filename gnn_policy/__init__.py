@@ -12,9 +12,10 @@ from gnn_policy.checkpoint import load, save
 from gnn_policy.execution import Execution
 from gnn_policy.network import DecentralizedPolicy, GraphFilter, PolicyConfig, shift_operator
 from gnn_policy.robot import Message, Robot
-from gnn_policy.rollout import Rollouts, rollout
+from gnn_policy.rollout import Actor, Rollouts, Teams, rollout
 
 __all__ = [
+    "Actor",
     "DecentralizedPolicy",
     "Execution",
     "GraphFilter",
@@ -22,6 +23,7 @@ __all__ = [
     "PolicyConfig",
     "Robot",
     "Rollouts",
+    "Teams",
     "load",
     "rollout",
     "save",

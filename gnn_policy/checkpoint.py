@@ -34,7 +34,14 @@ def save(policy: DecentralizedPolicy, path: PathLike, **about: str) -> None:
         policy: The policy.
         path: A file, by convention ending in `.safetensors`.
         about: Notes that travel with the weights, as the command that trained them.
+
+    Raises:
+        TypeError: If it is another network, which `load` could not build.
     """
+    if not isinstance(policy, DecentralizedPolicy):
+        raise TypeError(
+            f"save writes a DecentralizedPolicy, got {type(policy).__name__}: give its state_dict to torch.save"
+        )
     metadata = {**about, "format": FORMAT, "policy": json.dumps(asdict(policy.config))}
     weights = {name: _without_dust(tensor).contiguous() for name, tensor in policy.state_dict().items()}
     with replacing(path) as draft:
@@ -52,6 +59,8 @@ def _without_dust(tensor: torch.Tensor) -> torch.Tensor:
 
 def load(path: PathLike = PACKAGED) -> DecentralizedPolicy:
     """A policy in evaluation mode.
+
+    A policy that has an encoder or a graph layer of your own imports the module that its configuration names.
 
     Args:
         path: A file, a run folder of `gnn_policy.train`, or the name of a policy that comes with the package: by the

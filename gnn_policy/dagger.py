@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import functools
 import math
-import pkgutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +26,7 @@ from experts.many import SOLVER_NAMES
 from gnn_policy.config import Backend, RobotOrder, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.own_parts import own_part
 from gnn_policy.precision import autocast
 from gnn_policy.ranks import Ranks
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
@@ -62,7 +62,7 @@ class Teacher:
     ) -> None:
         self._instances, self._name, self._w, self._robot_order = instances, solver, w, robot_order
         self._node_limit, self._threads, self._clock = node_limit, threads, clock
-        self._solver = solver if solver in SOLVER_NAMES else _own_solver(solver)
+        self._solver = solver if solver in SOLVER_NAMES else own_part(solver, "the teacher", SOLVER_NAMES)
         self._goals = np.stack([each.goals for each in instances])
         self.seconds = 0.0
         """Time that it has taken to answer, so far."""
@@ -175,19 +175,6 @@ class Teacher:
 def _rows(array: npt.NDArray[Any], order: npt.NDArray[np.intp]) -> npt.NDArray[Any]:
     """(M, N, ...) with the N entries of each row in its own order (M, N)."""
     return array[np.arange(len(array))[:, None], order]
-
-
-def _own_solver(name: str) -> experts.Solver:
-    wanted = f"the teacher must be one of {', '.join(SOLVER_NAMES)}, or a solver of your own as 'module:function'"
-    if ":" not in name:
-        raise ValueError(f"{wanted}; got {name!r}")
-    try:
-        solver: Any = pkgutil.resolve_name(name)
-    except (ImportError, AttributeError, ValueError) as missing:
-        raise ValueError(f"{wanted}; {name!r} cannot be found: {missing}") from None
-    if not callable(solver):
-        raise ValueError(f"{wanted}; {name!r} is no function but {type(solver).__name__}")
-    return cast(experts.Solver, solver)
 
 
 class Mixture(TensorDictModuleBase):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -10,6 +11,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from gnn_policy.convolution import StridedConvolution
+from gnn_policy.own_parts import own_part
 from mapf_env import Action
 
 CommRange = Literal["fixed", "connected"]
@@ -20,9 +22,13 @@ CommWeights = Literal["binary", "distance"]
 class PolicyConfig:
     """All that defines a policy besides its weights; the defaults are the paper's."""
 
-    encoder: Literal["released", "lean"] = "released"
+    encoder: str = "released"
     """CNN that reads a view: "released" is that of the paper's released code (5 convolutions, 3 poolings), "lean" has
-    3 convolutions without poolings and costs a third."""
+    3 convolutions without poolings and costs a third; or a class of your own as "module:Class", made as `lean_encoder`
+    is."""
+    graph_layer: str = "filter"
+    """How robots use what they hear: "filter" is the paper's graph filter; or a class of your own as "module:Class",
+    made and called as `GraphFilter` is."""
     features: int = 128
     """Features F that a robot extracts and communicates."""
     taps: int = 3
@@ -40,8 +46,11 @@ class PolicyConfig:
     """See how many steps it is to the goal from each cell in view: a fourth channel, which needs the whole map."""
 
     def __post_init__(self) -> None:
+        for name, parts in (("encoder", ENCODERS), ("graph_layer", GRAPH_LAYERS)):
+            given = getattr(self, name)
+            if given not in parts and ":" not in given:
+                raise ValueError(f"{name} must be one of {', '.join(parts)}, or 'module:Class', got {given!r}")
         for name, known in (
-            ("encoder", tuple(ENCODERS)),
             ("comm_range", get_args(CommRange)),
             ("comm_weights", get_args(CommWeights)),
         ):
@@ -121,32 +130,51 @@ class GraphFilter(nn.Module):
         self.taps = taps
         self.mix = nn.Linear(taps * in_features, out_features)
 
-    def forward(self, signal: Float[Tensor, "B N F"], shift: Float[Tensor, "B N N"]) -> Float[Tensor, "B N G"]:
-        """Filter the features of all robots over the graph whose shift operator is `shift`."""
-        shifted = [signal]
+    def forward(self, signal: Float[Tensor, "B N F"], graph: Float[Tensor, "B N N"]) -> Float[Tensor, "B N G"]:
+        """Filter the features of all robots over the communication graph, by its shift operator."""
+        shift, shifted = shift_operator(graph), [signal]
         for _ in range(self.taps - 1):
             shifted.append(torch.bmm(shift, shifted[-1]))
         return self.mix(torch.cat(shifted, dim=-1))
+
+
+GRAPH_LAYERS = {"filter": GraphFilter}
+
+
+def _part(what: str, name: str, known: Mapping[str, Callable[..., nn.Module]]) -> Callable[..., nn.Module]:
+    """What makes the part of a network that has this name."""
+    if name in known:
+        return known[name]
+    part = own_part(name, what, known)
+    # Nothing else is called, for the name may come from a file.
+    if not (isinstance(part, type) and issubclass(part, nn.Module)):
+        raise ValueError(f"{what} must be a class of torch.nn.Module, which {name!r} is not")
+    return part
 
 
 class DecentralizedPolicy(nn.Module):
     """Views and the communication graph of a team to the logits of every robot's move.
 
     All robots share the weights, whose number does not depend on the team's size.
+
+    Raises:
+        ValueError: If the configuration names a part that cannot be found or is no network.
     """
 
     def __init__(self, config: PolicyConfig = PolicyConfig()) -> None:
         super().__init__()
         self.config = config
-        self.encoder = ENCODERS[config.encoder](config.channels, 2 * config.fov_radius + 3, config.features)
-        self.filter = GraphFilter(config.features, config.features, config.taps)
+        make_encoder = _part("encoder", config.encoder, ENCODERS)
+        make_layer = _part("graph_layer", config.graph_layer, GRAPH_LAYERS)
+        self.encoder = make_encoder(config.channels, 2 * config.fov_radius + 3, config.features)
+        self.filter = make_layer(config.features, config.features, config.taps)
         self.head = nn.Linear(config.features, len(Action))
         self.to(memory_format=torch.channels_last)
 
     def forward(self, fov: Shaped[Tensor, "B N C S S"], graph: Float[Tensor, "B N N"]) -> Float[Tensor, "B N 5"]:
         """Logits over the five moves from views (float or uint8) and adjacency."""
         features = self.extract(fov.flatten(0, 1)).unflatten(0, fov.shape[:2])
-        return self.decide(self.filter(features, shift_operator(graph)))
+        return self.decide(self.filter(features, graph))
 
     def extract(self, fov: Shaped[Tensor, "M C S S"]) -> Float[Tensor, "M F"]:
         """The features that robots extract from their views and communicate."""
@@ -164,5 +192,5 @@ class DecentralizedPolicy(nn.Module):
         return self.encoder(views)
 
     def decide(self, filtered: Float[Tensor, "*B F"]) -> Float[Tensor, "*B 5"]:
-        """Logits from what the graph filter gives."""
+        """Logits from what the graph layer gives."""
         return self.head(torch.relu(filtered))

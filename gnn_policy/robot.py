@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 
 from gnn_policy.execution import STUCK_MEMORY, Execution
-from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.network import DecentralizedPolicy, GraphFilter
 
 Features = npt.NDArray[np.float32]
 
@@ -58,12 +58,20 @@ class Robot:
         policy: The policy; its weights are shared, and it is put into evaluation mode.
         execution: How it chooses moves; shield and communication range are matters of the world and of no account here.
         seed: Of its draws; robots of one team need different ones.
+
+    Raises:
+        ValueError: If the policy has another graph layer than the graph filter, or the seed is out of range.
     """
 
     def __init__(self, policy: DecentralizedPolicy, execution: Execution = Execution(), seed: int = 0) -> None:
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed must lie in 0..2**64 - 1, got {seed}")
-        self._policy, self._execution = policy.eval(), execution
+        if not isinstance(policy.filter, GraphFilter):
+            raise ValueError(
+                f"robots on their own exchange the messages of a graph filter, but this policy has the graph layer "
+                f"{policy.config.graph_layer!r}: play it by rollout"
+            )
+        self._policy, self._filter, self._execution = policy.eval(), policy.filter, execution
         self._seed = np.array(seed, np.uint64)
         self._track: deque[tuple[int, int]] = deque(maxlen=STUCK_MEMORY)
         self._time = -1
@@ -140,7 +148,7 @@ class Robot:
         if len(self._gathered) != self.rounds + 1:
             raise RuntimeError(f"it heard {len(self._gathered) - 1} of {self.rounds} rounds: begin() and hear() first")
         with torch.inference_mode():
-            filtered = self._policy.filter.mix(self._tensor(np.concatenate(self._gathered)))
+            filtered = self._filter.mix(self._tensor(np.concatenate(self._gathered)))
             return self._policy.decide(filtered).cpu().numpy()
 
     def act(self) -> int:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import nn
 
 from gnn_policy.execution import (
     STUCK_MEMORY,
@@ -20,7 +21,7 @@ from gnn_policy.execution import (
     is_stuck,
     robot_seeds,
 )
-from gnn_policy.network import CommRange, CommWeights, DecentralizedPolicy
+from gnn_policy.network import CommRange, CommWeights, PolicyConfig
 from gnn_policy.perception import Perception
 from mapf_env import Instance, Solution, _native, rules
 
@@ -47,8 +48,9 @@ class Teams:
     """Steps since the start."""
 
 
+@runtime_checkable
 class Actor(Protocol):
-    """What chooses the moves of many teams at once."""
+    """What chooses the moves of many teams at once: a class of your own that has these three."""
 
     border: int
     """Cells of obstacles around the maps that `act` receives; at least the radius that it observes with."""
@@ -61,19 +63,31 @@ class Actor(Protocol):
 
 
 class PolicyActor:
-    """A trained policy on given cases, executed as `execution` says; it gives the values (B, N, 5) of the moves."""
+    """A network on given cases, executed as `execution` says; it gives the values (B, N, 5) of the moves.
 
-    def __init__(self, policy: DecentralizedPolicy, instances: Sequence[Instance], execution: Execution) -> None:
-        self.policy, self.execution = policy, execution
+    Raises:
+        TypeError: If the network has no `config`.
+    """
+
+    def __init__(self, policy: nn.Module, instances: Sequence[Instance], execution: Execution) -> None:
+        config = getattr(policy, "config", None)
+        if not isinstance(config, PolicyConfig):
+            kind = type(policy).__name__
+            raise TypeError(
+                f"{kind} does not say what its robots perceive: give it a `config`, as {kind}.config = "
+                "gnn_policy.PolicyConfig(fov_radius=4, comm_radius=5.0)"
+            )
+        self.policy, self.config, self.execution = policy, config, execution
         self._perception = Perception(
-            policy.config, instances, comm_range=execution.comm_range, comm_weights=execution.comm_weights
+            config, instances, comm_range=execution.comm_range, comm_weights=execution.comm_weights
         )
-        self.border = policy.config.fov_radius
+        self._device = next((each.device for each in policy.parameters()), torch.device("cpu"))
+        self.border = config.fov_radius
         self.memory = STUCK_MEMORY if execution.sample == "stuck" else 0
 
     def act(self, teams: Teams) -> npt.NDArray[np.float32]:
         """Observe, communicate and value the moves."""
-        count, device = len(teams.cases), self.policy.head.weight.device
+        count, device = len(teams.cases), self._device
         padded = np.arange(_padded_size(count)).clip(max=count - 1)
         fov, graph = self._perception.observe(
             teams.cases[padded], teams.obstacles[padded], teams.positions[padded], teams.goals[padded]
@@ -81,7 +95,7 @@ class PolicyActor:
         with torch.inference_mode():
             logits = self.policy(torch.from_numpy(fov).to(device), torch.from_numpy(graph).to(device))[:count]
         alarmed = is_stuck(teams.positions, teams.goals, teams.past)
-        if self.policy.config.taps > 1:  # with one tap robots do not communicate
+        if self.config.taps > 1:  # with one tap robots do not communicate
             alarmed |= hears_of(alarmed, graph[:count])
         seeds = robot_seeds(teams.seeds, graph.shape[1])
         return self.execution.values(logits.float().cpu().numpy(), alarmed, seeds, teams.time)
@@ -113,7 +127,7 @@ class Rollouts:
 
 
 def rollout(
-    policy: DecentralizedPolicy | Actor,
+    policy: nn.Module | Actor,
     instances: Sequence[Instance],
     *,
     shield: Shield = "idle",
@@ -131,7 +145,9 @@ def rollout(
     in the list nor on the others. So equal instances with equal seeds end equally.
 
     Args:
-        policy: A policy, or an actor of one's own, which heeds nothing of how policies are executed but the shield.
+        policy: A policy; or a network of your own that maps views (B, N, C, F, F) and graphs (B, N, N) to logits
+            (B, N, 5) and has a `config`, a `PolicyConfig` that says what its robots perceive; or an `Actor` of your
+            own, which heeds nothing of how policies are executed but the shield.
         instances: The problems; all with the same number of agents and maps of one size.
         shield: As in `Execution`.
         sample: As in `Execution`.
@@ -144,6 +160,7 @@ def rollout(
 
     Raises:
         ValueError: If the instances differ in size, or an argument is out of range.
+        TypeError: If `policy` is none of these.
     """
     if not instances:
         raise ValueError("there are no instances to play")
@@ -159,8 +176,13 @@ def rollout(
     if (limits < 1).any():
         raise ValueError(f"max_steps must be at least 1, got {limits.min()}")
     seeds = _seeds(instances, _one_for_each("seed", seed, len(instances)))
-    if not isinstance(policy, DecentralizedPolicy):
+    if isinstance(policy, Actor):
         return _play_all(policy, instances, seeds, limits, shield, batch_size)
+    if not isinstance(policy, nn.Module):
+        raise TypeError(
+            f"rollout plays a network or an actor, got {type(policy).__name__}: an actor has `border`, `memory` and "
+            "`act` (gnn_policy.Actor)"
+        )
     was_training = policy.training
     try:
         return _play_all(PolicyActor(policy.eval(), instances, execution), instances, seeds, limits, shield, batch_size)

@@ -2,12 +2,14 @@
 
 import json
 import os
+import sys
+from types import ModuleType
 
 import pytest
 import safetensors.torch
 import torch
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, checkpoint, evaluate, load, save
+from gnn_policy import DecentralizedPolicy, PolicyConfig, Robot, checkpoint, evaluate, load, save
 
 CONFIG = PolicyConfig(encoder="lean", features=8, taps=2, fov_radius=3, comm_radius=4.5)
 
@@ -36,6 +38,38 @@ def test_a_policy_returns_as_it_was_saved(policy, file):
     views, graph = torch.rand(2, 4, 3, 9, 9), torch.ones(2, 4, 4)
     assert torch.equal(again(views, graph), policy(views, graph))
     assert checkpoint.about(file)["command"] == "train me"
+
+
+class Own(torch.nn.Module):
+    """A graph layer of one's own, which hears nobody."""
+
+    def __init__(self, in_features, out_features, taps):
+        super().__init__()
+        self.mix = torch.nn.Linear(in_features, out_features)
+
+    def forward(self, signal, graph):
+        return self.mix(signal)
+
+
+def test_a_part_of_ones_own_returns_where_it_can_be_imported(tmp_path, monkeypatch):
+    module, file = ModuleType("my_parts"), tmp_path / "own.safetensors"
+    module.Own = Own  # pyright: ignore[reportAttributeAccessIssue]
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "my_parts", module)
+        policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, graph_layer="my_parts:Own")).eval()
+        save(policy, file)
+        views, graph = torch.rand(2, 4, 3, 11, 11), torch.ones(2, 4, 4)
+        assert torch.equal(load(file)(views, graph), policy(views, graph))
+        with pytest.raises(ValueError, match=r"messages of a graph filter, but .* has the graph layer 'my_parts:Own'"):
+            Robot(policy)
+    with pytest.raises(checkpoint.CheckpointError, match="'my_parts:Own' cannot be found"):
+        load(file)
+
+
+def test_other_networks_are_not_saved(tmp_path):
+    with pytest.raises(TypeError, match=r"save writes a DecentralizedPolicy, got Linear: .* torch\.save"):
+        save(torch.nn.Linear(3, 5), tmp_path / "linear.safetensors")  # pyright: ignore[reportArgumentType]
+    assert not os.listdir(tmp_path)
 
 
 def test_weights_too_small_to_show_are_saved_as_zero(policy, file):

@@ -1,6 +1,9 @@
 """The network's laws: weights for any team, symmetry between robots, and a reach of K - 1 hops."""
 
+import sys
 from collections import deque
+from dataclasses import replace
+from types import ModuleType
 
 import jaxtyping
 import numpy as np
@@ -111,11 +114,13 @@ def test_a_robot_out_of_range_changes_nothing():
 def test_the_filter_is_the_sum_over_taps_of_shifted_signals(seed, taps, robots):
     generator = np.random.default_rng(seed)
     graph_filter = GraphFilter(3, 4, taps).double()
-    signal, shift = generator.normal(size=(2, robots, 3)), generator.normal(size=(2, robots, robots))
+    signal = generator.normal(size=(2, robots, 3))
+    graph = torch.stack([random_graph(generator, robots) for _ in range(2)]).double()
+    shift = shift_operator(graph).numpy()
     weights = graph_filter.mix.weight.detach().numpy().T.reshape(taps, 3, 4)
     bias = graph_filter.mix.bias.detach().numpy()
     with torch.no_grad():
-        result = graph_filter(torch.from_numpy(signal), torch.from_numpy(shift)).numpy()
+        result = graph_filter(torch.from_numpy(signal), graph).numpy()
     for b in range(2):
         expected = np.tile(bias, (robots, 1))
         for k in range(taps):
@@ -155,6 +160,61 @@ def test_the_encoders_read_views_of_other_sizes(encoder, radius):
     policy = seeded_policy(encoder=encoder, fov_radius=radius)
     views = random_views(np.random.default_rng(0), 2, 3, radius)
     assert policy(views, torch.zeros(2, 3, 3)).shape == (2, 3, 5)
+
+
+class Means(torch.nn.Module):
+    """A graph layer of one's own: a robot's features beside the sum over its neighbours' at each hop."""
+
+    def __init__(self, in_features, out_features, taps):
+        super().__init__()
+        self.mix, self.taps = torch.nn.Linear(in_features, out_features), taps
+
+    def forward(self, signal, graph):
+        for _ in range(self.taps - 1):
+            signal = signal + graph @ signal
+        return self.mix(signal)
+
+
+class Flat(torch.nn.Sequential):
+    """An encoder of one's own."""
+
+    def __init__(self, channels, side, features):
+        super().__init__(torch.nn.Flatten(), torch.nn.Linear(channels * side * side, features))
+
+
+@pytest.fixture
+def my_parts(monkeypatch):
+    module = ModuleType("my_parts")
+    module.Means, module.Flat, module.number, module.make = Means, Flat, 5, lambda *sizes: Means(*sizes)  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setitem(sys.modules, "my_parts", module)
+
+
+@pytest.mark.usefixtures("my_parts")
+def test_parts_of_ones_own_have_their_place():
+    policy = seeded_policy(encoder="my_parts:Flat", graph_layer="my_parts:Means", taps=2, fov_radius=3)
+    generator = np.random.default_rng(0)
+    views, graph = random_views(generator, 2, 4, radius=3), random_graph(generator, 4).expand(2, 4, 4)
+    with torch.no_grad():
+        features = policy.encoder(views.float().flatten(0, 1)).unflatten(0, (2, 4))
+        expected = policy.head(torch.relu(policy.filter(features, graph)))
+        torch.testing.assert_close(policy(views, graph), expected)
+    assert isinstance(policy.encoder, Flat)
+    assert isinstance(policy.filter, Means)
+
+
+@pytest.mark.usefixtures("my_parts")
+@pytest.mark.parametrize("part", ["encoder", "graph_layer"])
+def test_parts_that_are_none_are_refused(part):
+    for name, message in [
+        ("mine", rf"{part} must be one of \w+(, \w+)*, or 'module:Class', got 'mine'"),
+        ("no.such.module:Part", f"{part} must be .*; 'no.such.module:Part' cannot be found: No module"),
+        ("my_parts:Other", f"{part} must be .*; 'my_parts:Other' cannot be found"),
+        ("my_parts:number", f"{part} must be .*; 'my_parts:number' is no function or class but int"),
+        ("my_parts:make", f"{part} must be a class of torch.nn.Module, which 'my_parts:make' is not"),
+        ("os:kill", f"{part} must be a class of torch.nn.Module"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            DecentralizedPolicy(replace(PolicyConfig(), **{part: name}))
 
 
 def test_shapes_that_do_not_fit_are_refused():

@@ -142,6 +142,34 @@ def test_nothing_executed_collides_and_the_judgement_is_right(seed, num_agents):
 SAMPLES = [False, True, "stuck"]
 
 
+class Plain(torch.nn.Module):
+    """A network of one's own, here one that does what the package's does."""
+
+    def __init__(self, policy):
+        super().__init__()
+        self.policy, self.config = policy, policy.config
+
+    def forward(self, fov, graph):
+        return self.policy(fov, graph)
+
+
+@pytest.mark.parametrize("settings", [{}, {"sample": "stuck"}, {"shield": "pibt", "comm_range": "connected"}])
+def test_a_network_of_ones_own_is_executed_like_a_policy(cases, policy, settings):
+    network = Plain(policy).train()
+    played = rollout(network, cases, max_steps=20, **settings)
+    expected = rollout(policy, cases, max_steps=20, **settings)
+    for one, other in zip(played.solutions, expected.solutions, strict=True):
+        assert np.array_equal(one.paths, other.paths)
+    assert network.training
+
+
+def test_what_is_neither_network_nor_actor_is_refused(cases):
+    with pytest.raises(TypeError, match=r"Linear does not say .*: give it a `config`, .*PolicyConfig"):
+        rollout(torch.nn.Linear(3, 5), cases)
+    with pytest.raises(TypeError, match=r"plays a network or an actor, got str: an actor has `border`"):
+        rollout("n12", cases)  # pyright: ignore[reportArgumentType]
+
+
 @pytest.mark.parametrize("sample", SAMPLES)
 def test_the_policy_is_judged_like_anyone(cases, policy, sample):
     played = rollout(policy, cases, sample=sample, max_steps=30, seed=2)

@@ -19,7 +19,7 @@ import torch
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from gnn_policy import PolicyConfig, load, rollout, training
+from gnn_policy import DecentralizedPolicy, PolicyConfig, load, rollout, training
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.training import Training, open_run, split_cases
@@ -61,6 +61,27 @@ def timeless(rows):
 def metrics(folder):
     with (folder / "metrics.csv").open(newline="") as file:
         return timeless(csv.DictReader(file))
+
+
+class Deaf(torch.nn.Module):
+    """A graph layer of one's own, which hears nobody."""
+
+    def __init__(self, in_features, out_features, taps):
+        super().__init__()
+        self.mix = torch.nn.Linear(in_features, out_features)
+
+    def forward(self, signal, graph):
+        return self.mix(signal)
+
+
+def test_a_graph_layer_of_ones_own_is_trained_and_loaded(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "their_layers", SimpleNamespace(Deaf=Deaf))
+    config = replace(CONFIG, policy=replace(CONFIG.policy, graph_layer="their_layers:Deaf"))
+    run = trained(config, tmp_path)
+    assert isinstance(load(tmp_path).filter, Deaf)
+    torch.manual_seed(config.seed)
+    begun = DecentralizedPolicy(config.policy).state_dict()
+    assert not torch.equal(weights(run)["filter.mix.weight"], begun["filter.mix.weight"])
 
 
 @pytest.fixture(scope="module")
