@@ -1,6 +1,7 @@
 """The code of README and docs runs as it stands there, block after block of a page.
 
-Long commands are parsed but not carried out, and commands of installation are looked up.
+Long commands are parsed but not carried out, and commands of installation are looked up. A block that begins with the
+name of a file, as `# my_layers.py`, is also saved as that.
 
 The pages of docs/frameworks need packages that can't stand beside each other. Each runs in an interpreter of its own
 where its packages are, and is skipped elsewhere; `pytest tests/test_pages.py -k PAGE -s` shows what it measures.
@@ -88,6 +89,7 @@ def test_the_code_blocks_run_one_after_another(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     instance = random_instance(height=16, width=16, num_agents=50, seed=0)
     save_map("FILE.map", instance.grid)
     save_scen("FILE.scen", instance, "FILE.map")
@@ -95,6 +97,8 @@ def test_the_code_blocks_run_one_after_another(
     names: dict[str, object] = {}
     for language, block in blocks(page):
         if language == "python":
+            if named := re.match(r"# (\w+\.py)\n", block):
+                Path(named[1]).write_text(block)
             exec(compile(block, page, "exec"), names)
         elif language in ("sh", "bash"):
             for line in block.splitlines():
