@@ -294,12 +294,13 @@ class Aggregator:
         config, demonstrated = self._config, round_number == 0
         stuck_only = config.aggregation == "stuck" and not demonstrated
         mining = 1 if demonstrated else config.hard_case_mining
-        seen: list[tuple[npt.NDArray[Any], ...]] = []
+        keys = (CASE, POSITIONS, ("next", "truncated"), ("next", "terminated"))
+        seen: list[list[npt.NDArray[Any]]] = [[] for _ in keys]
         for _ in range(mining * -(-steps // (config.rollout_teams * config.rollout_length))):
             visited = next(self._batches)
-            parts = (visited[CASE], visited[POSITIONS], visited["next", "truncated"], visited["next", "terminated"])
-            seen.append(tuple(part.numpy().copy() for part in parts))
-        cases, positions, truncated, terminated = (np.concatenate(part) for part in zip(*seen, strict=True))
+            for key, found in zip(keys, seen, strict=True):
+                found.append(np.asarray(visited[key]).copy())
+        cases, positions, truncated, terminated = map(np.concatenate, seen)
         arrived = terminated.any(axis=(1, 2))
         teams = np.sort(arrived.argsort(kind="stable")[: len(arrived) // mining])
         asked = truncated[teams, :, 0] if stuck_only else np.ones(cases[teams].shape, np.bool_)
