@@ -297,7 +297,7 @@ class Aggregator:
         keys = (CASE, POSITIONS, ("next", "truncated"), ("next", "terminated"))
         seen: list[list[npt.NDArray[Any]]] = [[] for _ in keys]
         for _ in range(mining * -(-steps // (config.rollout_teams * config.rollout_length))):
-            visited = next(self._batches)
+            visited = next(self._batches).reshape(-1, config.rollout_length)  # collectors side by side are stacked
             for key, found in zip(keys, seen, strict=True):
                 found.append(np.asarray(visited[key]).copy())
         cases, positions, truncated, terminated = map(np.concatenate, seen)

@@ -137,7 +137,6 @@ class Training:
         ranks.share("rollout_teams", config.rollout_teams)
         self.threads = config.threads or max(cpu_threads(0) // ranks.local_count, 1)
         torch.set_num_threads(self.threads)
-        torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         torch.manual_seed(config.seed)
         self.policy = _on_device(DecentralizedPolicy(config.policy), config.device)
         self.loss = ImitationLoss(ranks.average_gradients(self.policy))
@@ -192,6 +191,7 @@ class Training:
         batches = BatchMaker(self._instances, config.policy, augment=config.augment)
         aggregator = Aggregator(config, self.policy, self._teacher, self._instances, self.ranks)
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
+        torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
             for number in range(len(self.history), config.epochs):
                 row = self._round(number, aggregator, batches, exam)
@@ -204,6 +204,7 @@ class Training:
                     self._save()
                 self.progress.finished(row)
         finally:
+            torch.set_flush_denormal(False)
             aggregator.close()
             if writer is not None:
                 writer.close()
