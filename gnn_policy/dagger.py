@@ -301,8 +301,8 @@ class Aggregator:
             for key, found in zip(keys, seen, strict=True):
                 found.append(np.asarray(visited[key]).copy())
         cases, positions, truncated, terminated = map(np.concatenate, seen)
-        arrived = terminated.any(axis=(1, 2))
-        teams = np.sort(arrived.argsort(kind="stable")[: len(arrived) // mining])
+        arrived = terminated.reshape(len(terminated), -1).any(axis=1)
+        teams = np.sort(arrived.argsort(kind="stable")[: len(terminated) // mining])
         asked = truncated[teams, :, 0] if stuck_only else np.ones(cases[teams].shape, np.bool_)
         ask = self._teacher.demonstrate if stuck_only else self._teacher.label
         return ask(cases[teams][asked], positions[teams][asked])
