@@ -36,6 +36,7 @@ h1{font-size:24px}h2{font-size:19px;margin-top:36px}
 section{display:flex;flex-wrap:wrap;gap:12px}
 section svg{flex:1 1 330px;min-width:0;max-width:500px;height:auto}
 iframe{width:100%;height:720px;border:1px solid #cbd2da;border-radius:6px;background:#fff}
+@media (max-width:660px){iframe{height:800px}}
 pre{background:#fff;border:1px solid #cbd2da;padding:10px;overflow-x:auto;font-size:12px}
 """
 
