@@ -156,7 +156,8 @@ class Experiment:
 
     def __init__(self, options: Options, console: Console) -> None:
         self.options, self.console = options, console
-        self.variants = {each.name: each for each in map(Execution.parse, options.rows + options.own_size_rows)}
+        self.rows = [Execution.parse(name).name for name in options.rows]
+        self.own_size_rows = [Execution.parse(name).name for name in options.own_size_rows]
         self.models = [Model(N, K, kind) for kind in options.kinds for K in options.taps for N in options.train_on]
         self.models = [model for model in self.models if self._wanted(model)]
         self.scenes = [Scene(style, N) for style in options.styles for N in TEAMS]
@@ -323,7 +324,7 @@ class Experiment:
         measures = (("success_rate", "success rate"), ("flowtime_increase", "flowtime increase"))
         for axes, (measure, label) in zip(panels, measures, strict=True):
             for taps in sorted(self.options.taps):
-                for row, line in zip(self.variants, ("-", "--", ":"), strict=False):
+                for row, line in zip([*self.rows, *self.own_size_rows], ("-", "--", ":"), strict=False):
                     self._line(axes, style, taps, row, measure, line)
             axes.set(xlabel="robots, in training and test", ylabel=label, xticks=list(self.options.train_on))
             axes.grid(alpha=0.3)
@@ -355,7 +356,7 @@ class Experiment:
         )
 
     def _figure3(self, style: MapStyle) -> Figure:
-        first = next(iter(self.variants))
+        first = self.rows[0]
         ours = self._heat(style, first)
         paper = np.array([PAPER[N] for N in PAPER])
         figure, panels = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
@@ -388,20 +389,23 @@ class Experiment:
         for style in self.options.styles:
             for size in dict.fromkeys(scene.size for scene in self.scenes):
                 scenes = [scene for scene in self.scenes if (scene.style, scene.size) == (style, size)]
-                scenes = [scene for scene in scenes if any(self._row(scene, *each) for each in self._players(scenes))]
+                scenes = [scene for scene in scenes if self._result(scene, "baselines").exists()]
                 if not scenes:
                     continue
                 tested = [json.loads(self._result(scene, "baselines").read_text()) for scene in scenes]
+                players = self._players([row["name"] for row in tested[0]["rows"]])
                 yield f"## {style.capitalize()}, {size} x {size}\n"
                 cases = " or ".join(sorted({str(each["cases"]) for each in tested}))
-                over = max(each["expert_over_bound"] for each in tested)
-                yield f"{cases} cases for each size of the team; the expert's flowtime is {over:.4f} of its bound.\n"
+                expert = (
+                    f"the expert's flowtime is {max(each['expert_over_bound'] for each in tested):.4f} of its bound"
+                )
+                yield f"{cases} cases for each size of the team; {expert} at most.\n"
                 if size == 20:
-                    for row in list(self.variants)[: len(self.options.rows)]:
+                    for row in self.rows:
                         yield from self._figure3_table(style, row)
                 for measure, title in MEASURES.items():
                     yield f"### {title}\n"
-                    yield from self._table(scenes, measure)
+                    yield from self._table(scenes, players, measure)
                     yield ""
 
     def _figure3_table(self, style: MapStyle, row: str) -> Iterator[str]:
@@ -419,10 +423,10 @@ class Experiment:
             yield f"| {N} | " + " | ".join(cells) + " |"
         yield ""
 
-    def _table(self, scenes: Sequence[Scene], measure: str) -> Iterator[str]:
+    def _table(self, scenes: Sequence[Scene], players: Sequence[tuple[str, str]], measure: str) -> Iterator[str]:
         yield "| robots | " + " | ".join(str(scene.num_agents) for scene in scenes) + " |"
         yield "|---|" + "---|" * len(scenes)
-        for player, row in self._players(scenes):
+        for player, row in players:
             found = [self._row(scene, player, row) for scene in scenes]
             if any(found):
                 cells = [_cell(measure, each) if each else "" for each in found]
@@ -433,21 +437,14 @@ class Experiment:
                 cells = [f"{line[scene.num_agents]:.3f}" for scene in scenes]
                 yield f"| paper, trained on {trained_on} | " + " | ".join(cells) + " |"
 
-    def _players(self, scenes: Sequence[Scene]) -> list[tuple[str, str]]:
+    def _players(self, baselines: Sequence[str]) -> list[tuple[str, str]]:
         """Who may have been tested, and how each was executed."""
         models = [
             (model.name, execution.name)
             for model in self.models
             for execution in self._executions(Scene("cells", model.num_agents), model)
         ]
-        return [*models, *(("baselines", row) for row in self._names_of_baselines(scenes))]
-
-    def _names_of_baselines(self, scenes: Sequence[Scene]) -> list[str]:
-        for scene in scenes:
-            path = self._result(scene, "baselines")
-            if path.exists():
-                return [row["name"] for row in json.loads(path.read_text())["rows"]]
-        return []
+        return [*models, *(("baselines", row) for row in baselines)]
 
 
 def _own_size(scene: Scene, model: Model) -> bool:

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from paper import PAPER, TEAMS
 
 from gnn_policy.command_line import mistakes_in_one_line
-from gnn_policy.failures import Failure
+from gnn_policy.failures import MEANINGS
 from mapf_env.files import write_whole
 
 STYLE = """
@@ -39,16 +39,6 @@ iframe{width:100%;height:720px;border:1px solid #cbd2da;border-radius:6px;backgr
 @media (max-width:660px){iframe{height:800px}}
 pre{background:#fff;border:1px solid #cbd2da;padding:10px;overflow-x:auto;font-size:12px}
 """
-
-
-KINDS: dict[Failure, str] = {
-    "out of time": "nobody is stalled; with more steps the team might have done it",
-    "goal blocked": "robots that rest on their own goals cut off a stalled robot from its own",
-    "deadlock": "the stalled robots stand still",
-    "oscillation": "each stalled robot stays on at most two cells, some going to and fro",
-    "livelock": "the stalled robots move about and get nowhere",
-}
-"""As gnn_policy.failures tells them apart."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +108,9 @@ class Run:
 def _exam(settings: dict[str, Any] | None) -> str:
     if not settings:
         return "not examined"
-    maps = "{maps} {split} maps of {styles}, {height} x {width}, {cases_per_map} cases each, "
-    styles = " and ".join(settings["styles"])
-    return (maps + "w = {w}, T_max {timeout} makespans").format(**{**settings, "styles": styles})
+    styles, size = " and ".join(settings["styles"]), f"{settings['height']} x {settings['width']}"
+    maps = f"{settings['maps']} {settings['split']} maps of {styles}, {size}, {settings['cases_per_map']} cases each"
+    return f"{maps}, w = {settings['w']}, T_max {settings['timeout']} makespans"
 
 
 def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
@@ -153,7 +143,7 @@ def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
         ]
         parts += ["<h2>Success and flowtime against the number of robots</h2>", against_robots(examined)]
         parts += ["<h2>Success beside the paper's</h2>", heat_maps(examined)]
-        kinds = "".join(f"<li><b>{kind}</b>: {meaning}</li>" for kind, meaning in KINDS.items())
+        kinds = "".join(f"<li><b>{kind}</b>: {meaning}</li>" for kind, meaning in MEANINGS.items())
         parts += ["<h2>Why teams failed</h2>", f"<ul>{kinds}</ul>", failures(examined)]
     for run in examined:
         if run.failures is not None:
@@ -237,7 +227,7 @@ def failure_bars(run: Run, row: str) -> Axes:
     """Failed cases by the number of robots, the kinds upon one another."""
     bars = axes()
     sizes, upon = list(run.results), np.zeros(len(run.results))
-    for kind in KINDS:
+    for kind in MEANINGS:
         found = np.array([table["failures"][row].get(kind, 0) for table in run.results.values()])
         bars.bar(sizes, found, bottom=upon, label=kind)
         upon += found

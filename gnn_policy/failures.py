@@ -13,6 +13,14 @@ from gnn_policy.rollout import Rollouts
 from mapf_env import Instance, Scene, Solution, _native
 
 Failure = Literal["goal blocked", "deadlock", "oscillation", "livelock", "out of time"]
+MEANINGS: dict[Failure, str] = {
+    "out of time": "nobody is stalled; with more steps the team might have done it",
+    "goal blocked": "robots that rest on their goals throughout the last steps cut off a stalled robot from its own",
+    "deadlock": "the stalled robots stand still throughout the last steps",
+    "oscillation": "each stalled robot stays on at most two cells, some going to and fro",
+    "livelock": "the stalled robots move about and get nowhere",
+}
+"""The kinds of failure, in the order in which they are asked for."""
 
 LAST_STEPS = 16
 """How many steps at the end of an episode tell why it failed."""
@@ -22,14 +30,7 @@ def failure(instance: Instance, solution: Solution) -> Failure | None:
     """The kind of failure, or None where all robots end on their goals.
 
     A robot is late if it ends off its goal, and stalled if it is late and came no nearer to its goal (by shortest ways
-    on the empty map) in the last steps than it had ever been before. The first that holds:
-
-    - "out of time": nobody is stalled; with more steps the team might have done it.
-    - "goal blocked": robots that rest on their own goals throughout the last steps cut off a stalled robot from its
-      own.
-    - "deadlock": the stalled robots stand still throughout the last steps.
-    - "oscillation": each of them stays on at most two cells, some to and fro.
-    - "livelock": they move about and get nowhere.
+    on the empty map) in the last steps than it had ever been before. The kind is the first of `MEANINGS` that holds.
 
     Args:
         instance: The problem.

@@ -81,7 +81,8 @@ def examine(
             console.print(evaluation.table(title, rows, exam))
             kinds = {each.name: count_failures(played) for each, played in zip(variants, shown, strict=True)}
             tables[str(N)] = {**evaluation.as_json(rows, exam), "failures": kinds}
-            scenes += worst(shown[0], exam.solutions, failures)
+            if failures:
+                scenes += worst(shown[0], exam.solutions, failures)
     best = max(shown, key=lambda played: played.success.mean())
     case = _worth_watching(best)
     outcome = "all on goal" if best.success[case] else "timed out"

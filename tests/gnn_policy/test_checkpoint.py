@@ -10,6 +10,7 @@ import safetensors.torch
 import torch
 
 from gnn_policy import DecentralizedPolicy, PolicyConfig, Robot, checkpoint, evaluate, load, save
+from own_layers import Deaf
 
 CONFIG = PolicyConfig(encoder="lean", features=8, taps=2, fov_radius=3, comm_radius=4.5)
 
@@ -40,20 +41,9 @@ def test_a_policy_returns_as_it_was_saved(policy, file):
     assert checkpoint.about(file)["command"] == "train me"
 
 
-class Own(torch.nn.Module):
-    """A graph layer of one's own, which hears nobody."""
-
-    def __init__(self, in_features, out_features, taps):
-        super().__init__()
-        self.mix = torch.nn.Linear(in_features, out_features)
-
-    def forward(self, signal, graph):
-        return self.mix(signal)
-
-
 def test_a_part_of_ones_own_returns_where_it_can_be_imported(tmp_path, monkeypatch):
     module, file = ModuleType("my_parts"), tmp_path / "own.safetensors"
-    module.Own = Own  # pyright: ignore[reportAttributeAccessIssue]
+    module.Own = Deaf  # pyright: ignore[reportAttributeAccessIssue]
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "my_parts", module)
         policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, graph_layer="my_parts:Own")).eval()

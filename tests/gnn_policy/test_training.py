@@ -23,6 +23,7 @@ from gnn_policy import DecentralizedPolicy, PolicyConfig, load, rollout, trainin
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.training import Training, open_run, split_cases
+from own_layers import Deaf
 from small_training import CONFIG
 
 
@@ -63,20 +64,8 @@ def metrics(folder):
         return timeless(csv.DictReader(file))
 
 
-class Deaf(torch.nn.Module):
-    """A graph layer of one's own, which hears nobody."""
-
-    def __init__(self, in_features, out_features, taps):
-        super().__init__()
-        self.mix = torch.nn.Linear(in_features, out_features)
-
-    def forward(self, signal, graph):
-        return self.mix(signal)
-
-
-def test_a_graph_layer_of_ones_own_is_trained_and_loaded(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "their_layers", SimpleNamespace(Deaf=Deaf))
-    config = replace(CONFIG, policy=replace(CONFIG.policy, graph_layer="their_layers:Deaf"))
+def test_a_graph_layer_of_ones_own_is_trained_and_loaded(tmp_path):
+    config = replace(CONFIG, policy=replace(CONFIG.policy, graph_layer="own_layers:Deaf"))
     run = trained(config, tmp_path)
     assert isinstance(load(tmp_path).filter, Deaf)
     torch.manual_seed(config.seed)
