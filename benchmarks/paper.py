@@ -249,14 +249,14 @@ class Experiment:
         """Which model is tested where."""
         for scene in self.scenes:
             for model in self.models:
-                general = model.taps == 3 and model.kind != "connected" and scene.size == 20
                 large = model == Model(LARGEST, 3) and scene.size == 50
-                if general or large or _own_size(scene, model):
+                if large or (scene.size == 20 and _general(model)) or _own_size(scene, model):
                     yield scene, model
 
-    def _executions(self, scene: Scene, model: Model) -> list[Execution]:
-        names = self.options.rows + (self.options.own_size_rows if _own_size(scene, model) else ())
+    def _executions(self, model: Model, own_size: bool) -> list[Execution]:
+        """How a model is executed, on teams of the size it was trained on or of others."""
         shield = ",pibt" if model.kind == "informed" else ""
+        names = (*self.options.rows, *(self.options.own_size_rows if own_size else ()))
         return [Execution.parse(name + shield) for name in names]
 
     def _result(self, scene: Scene, player: str) -> Path:
@@ -278,7 +278,7 @@ class Experiment:
     ) -> tuple[list[evaluation.Score], dict[str, dict[Failure, int]]]:
         """A row for each way to execute the model, and how its teams failed."""
         policy, rows, failures = checkpoint.load(self.run_of(model)), [], {}
-        for execution in self._executions(scene, model):
+        for execution in self._executions(model, _own_size(scene, model)):
             with autocast(self.options.precision, torch.device("cpu")):
                 played = rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(execution))
             rows.append(evaluation.score(execution.name, exam, played))
@@ -310,7 +310,7 @@ class Experiment:
         with torch.inference_mode(), autocast(self.options.precision, fov.device):
             each = _seconds(lambda: policy(fov, graph), times=2) / 64
         cases = model.config.test_maps * self.options.cases_per_map
-        return 1.25 * each * cases * STEPS[scene.size] * len(self._executions(scene, model))
+        return 1.25 * each * cases * STEPS[scene.size] * len(self._executions(model, _own_size(scene, model)))
 
     def _row(self, scene: Scene, player: str, row: str) -> dict[str, Any] | None:
         path = self._result(scene, player)
@@ -403,6 +403,8 @@ class Experiment:
                 if size == 20:
                     for row in self.rows:
                         yield from self._figure3_table(style, row)
+                    for measure in ("success_rate", "flowtime_increase"):
+                        yield from self._figure2_table(style, measure)
                 for measure, title in MEASURES.items():
                     yield f"### {title}\n"
                     yield from self._table(scenes, players, measure)
@@ -423,6 +425,22 @@ class Experiment:
             yield f"| {N} | " + " | ".join(cells) + " |"
         yield ""
 
+    def _figure2_table(self, style: MapStyle, measure: str) -> Iterator[str]:
+        """A line for each kind of model, K and way to execute, a column for each size of the team."""
+        sizes = sorted({model.num_agents for model in self.models})
+        labels = {"paper": "", "connected": ", radius grown", "informed": ", informed"}
+        yield f"### Figure 2, teams of the size of training: {MEASURES[measure]}\n"
+        yield "| model | " + " | ".join(map(str, sizes)) + " |"
+        yield "|---|" + "---|" * len(sizes)
+        for kind, label in labels.items():
+            for taps in sorted({model.taps for model in self.models if model.kind == kind}):
+                for execution in self._executions(Model(LARGEST, taps, kind), own_size=True):
+                    line = [self._row(Scene(style, N), Model(N, taps, kind).name, execution.name) for N in sizes]
+                    if any(line):
+                        cells = [_cell(measure, each) if each else "" for each in line]
+                        yield f"| K = {taps}{label}, {execution.name} | " + " | ".join(cells) + " |"
+        yield ""
+
     def _table(self, scenes: Sequence[Scene], players: Sequence[tuple[str, str]], measure: str) -> Iterator[str]:
         yield "| robots | " + " | ".join(str(scene.num_agents) for scene in scenes) + " |"
         yield "|---|" + "---|" * len(scenes)
@@ -438,13 +456,20 @@ class Experiment:
                 yield f"| paper, trained on {trained_on} | " + " | ".join(cells) + " |"
 
     def _players(self, baselines: Sequence[str]) -> list[tuple[str, str]]:
-        """Who may have been tested, and how each was executed."""
+        """Who may have been tested on teams of any size, and how each was executed."""
         models = [
             (model.name, execution.name)
             for model in self.models
-            for execution in self._executions(Scene("cells", model.num_agents), model)
+            if _general(model)
+            for execution in self._executions(model, own_size=False)
         ]
         return [*models, *(("baselines", row) for row in baselines)]
+
+
+def _general(model: Model) -> bool:
+    """Whether it is tested on every size of the team."""
+    without_communication = model == Model(LARGEST, 1)
+    return without_communication or (model.taps == 3 and model.kind != "connected")
 
 
 def _own_size(scene: Scene, model: Model) -> bool:
