@@ -12,8 +12,9 @@ import random
 from itertools import cycle
 from typing import Any
 
-from cpu_clock import calls_per_second
 from pogema import GridConfig, pogema_v0  # pyright: ignore[reportMissingImports]
+
+from cpu_clock import calls_per_second
 
 
 def main() -> None:

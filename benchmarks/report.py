@@ -23,11 +23,12 @@ import numpy as np
 import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from paper import PAPER, TEAMS
 
 from gnn_policy.command_line import mistakes_in_one_line
 from gnn_policy.failures import MEANINGS
 from mapf_env.files import write_whole
+from paper_experiment import PAPER, TEAMS
+from paper_figures import heat_map
 
 STYLE = """
 body{margin:0;font:15px/1.5 system-ui,sans-serif;background:#f6f7f9;color:#1f2530}
@@ -193,29 +194,17 @@ def heat_maps(runs: Sequence[Run]) -> str:
     ours = {run.name: dict(run.estimates(run.rows()[0], "success_rate")) for run in sorted(runs, key=by_size)}
     paper = {str(size): dict(zip(TEAMS, row, strict=True)) for size, row in PAPER.items()}
     columns = sorted({size for row in (*ours.values(), *paper.values()) for size in row})
-    return side_by_side(
-        heat_map("here, first way of execution", ours, columns), heat_map("paper, trained on", paper, columns)
-    )
+    pictures = []
+    for title, table in (("here, first way of execution", ours), ("paper, trained on", paper)):
+        pictures.append(axes())
+        values = np.array([[row.get(size, np.nan) for size in columns] for row in table.values()])
+        heat_map(pictures[-1], title, values, list(table), columns)
+    return side_by_side(*pictures)
 
 
 def by_size(run: Run) -> tuple[int, str]:
     """Runs in the order of their training teams."""
     return run.trained_on, run.name
-
-
-def heat_map(name: str, table: dict[str, dict[int, float]], columns: Sequence[int]) -> Axes:
-    """A cell for each pair of training and test teams; white where there is no number."""
-    map_axes = axes()
-    values = np.array([[row.get(column, np.nan) for column in columns] for row in table.values()])
-    map_axes.imshow(values, vmin=0.3, vmax=1, cmap="viridis", aspect="auto")
-    map_axes.set(title=name, xlabel="test robots")
-    map_axes.set_xticks(range(len(columns)), list(map(str, columns)))
-    map_axes.set_yticks(range(len(table)), list(table))
-    for (i, j), value in np.ndenumerate(values):
-        if not np.isnan(value):
-            colour = "w" if value < 0.8 else "k"
-            map_axes.text(j, i, f"{value:.3f}".removeprefix("0"), ha="center", va="center", color=colour)
-    return map_axes
 
 
 def failures(runs: Sequence[Run]) -> str:

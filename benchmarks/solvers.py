@@ -14,11 +14,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import solver_peers
 from rich.console import Console
 from rich.table import Table
 
 import experts
+import solver_peers
 from experts import Result, Solver
 from mapf_env import Instance, load_scen, random_instance
 

@@ -25,14 +25,14 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from cpu_clock import calls_per_second
-from peer_venv import CACHE, peer_python
 from rich import box
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 import mapf_env
+from cpu_clock import calls_per_second
+from peer_venv import CACHE, peer_python
 
 ROOT = Path(__file__).parents[1]
 PEER = "pogema==1.4.0"

@@ -1,8 +1,6 @@
 """The ablation trains what is not finished, and its table says what the runs say."""
 
-import importlib.util
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -11,23 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ablation as script
 from gnn_policy.network import PolicyConfig
 from mapf_env import Solution
-
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "ablation.py"
 
 
 @pytest.fixture
 def ablation(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The script with runs of a second, found by its name as when it is run."""
-    spec = importlib.util.spec_from_file_location("ablation", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "ablation", module)
-    spec.loader.exec_module(module)
+    """The script with runs of a second."""
     tiny = replace(
-        module.BASE,
+        script.BASE,
         policy=PolicyConfig(encoder="lean", features=8, fov_radius=2),
         num_agents=3,
         height=8,
@@ -42,8 +33,9 @@ def ablation(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         rollout_length=8,
         batch_size=4,
     )
-    monkeypatch.setattr(module, "BASE", tiny)
-    return module
+    monkeypatch.setattr(script, "BASE", tiny)
+    script.the_exam.cache_clear()
+    return script
 
 
 def rows(table: str) -> list[list[str]]:

@@ -1,20 +1,19 @@
 """The judge of the audit finds what is wrong, and the audit passes on what is right."""
 
-import runpy
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-AUDIT = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "audit.py"))
+from audit import Options, judge, main
+
 UP, LEFT, DOWN, RIGHT, IDLE = range(5)
 RING = [(0, 0), (0, 1), (1, 1), (1, 0)]
 
 
 def judged(before: Any, wanted: Any, after: Any, replaced: Any, grid: Any = ((0, 0, 0), (0, 0, 1))) -> tuple[int, int]:
     """Collisions and other faults of one step of one team."""
-    tally = AUDIT["judge"](
+    tally = judge(
         np.array([grid], bool), np.array([before]), np.array([wanted]), np.array([after]), np.array([replaced])
     )
     return tally.collisions, tally.other_faults
@@ -45,5 +44,5 @@ def test_the_judge_counts(before: Any, wanted: Any, after: Any, replaced: Any, e
 
 
 def test_the_audit_passes(capsys: pytest.CaptureFixture[str]) -> None:
-    assert AUDIT["main"](AUDIT["Options"](steps=20_000, robots_at_once=64)) == 0
+    assert main(Options(steps=20_000, robots_at_once=64)) == 0
     assert "replaced" in capsys.readouterr().out

@@ -1,20 +1,19 @@
 """The paper's experiment does only what is not done, and its tables and figures say what was tested."""
 
 import json
-import runpy
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+import paper
 from gnn_policy.config import RECIPES
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.training import Training
+from paper_experiment import Experiment, Model, Options, Scene
+from paper_figures import draw, success_rates, tables
 from small_training import CONFIG
-
-PAPER = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "paper.py"))
-Experiment, Model, Options, Scene = (PAPER[name] for name in ("Experiment", "Model", "Options", "Scene"))
 
 
 class Stop(TrainingProgress):
@@ -33,7 +32,7 @@ def experiment(folder: Path, **changes: object):
         "cases_per_map": 1,
         "large": False,
     }
-    return Experiment(Options(**{**options, **changes}), Console(quiet=True))
+    return Experiment(Options(**{**options, **changes}))
 
 
 def finish(whole, model, success: float = 0.5) -> None:
@@ -42,7 +41,7 @@ def finish(whole, model, success: float = 0.5) -> None:
     (whole.run_of(model) / "metrics.csv").write_text("a round\n" * (1 + model.config.epochs))
     estimate = {"mean": success, "low": success - 0.1, "high": success + 0.1}
     measures = ("success_rate", "flowtime_increase", "flowtime_increase_solved", "makespan")
-    folder = whole._result(Scene("cells", model.num_agents), model.name).parent
+    folder = whole.result(Scene("cells", model.num_agents), model.name).parent
     folder.mkdir(parents=True)
     for player, row in ((model.name, "argmax"), ("baselines", "PIBT*")):
         rows = [{"name": row, **dict.fromkeys(measures, estimate), "latched": 0.875}]
@@ -50,14 +49,15 @@ def finish(whole, model, success: float = 0.5) -> None:
 
 
 def test_figure_two_tests_every_k_on_its_own_size_and_figure_three_k_3_on_all(tmp_path):
-    pairs = {(scene.name, model.name) for scene, model in experiment(tmp_path)._pairs()}
+    pairs = {(scene.name, model.name) for scene, model in experiment(tmp_path).pairs()}
     own = {(f"20x20-cells-n{N}", f"n{N}-k{K}") for N in (4, 12) for K in (1, 2, 3)}
     general = {(f"20x20-cells-n{N}", f"n{M}-k3") for N in (4, 6, 8, 10, 12, 14) for M in (4, 12)}
-    assert pairs == own | general
-    large = {(scene.name, model.name) for scene, model in experiment(tmp_path, large=True)._pairs()} - pairs
+    without_communication = {(f"20x20-cells-n{N}", "n12-k1") for N in (4, 6, 8, 10, 12, 14)}
+    assert pairs == own | general | without_communication
+    large = {(scene.name, model.name) for scene, model in experiment(tmp_path, large=True).pairs()} - pairs
     assert large == {(f"50x50-cells-n{N}", "n12-k3") for N in (20, 40, 60)}
     kinds = ("connected", "informed")
-    beyond = {(scene.name, model.name) for scene, model in experiment(tmp_path, kinds=kinds)._pairs()}
+    beyond = {(scene.name, model.name) for scene, model in experiment(tmp_path, kinds=kinds).pairs()}
     connected = {("20x20-cells-n12", f"n12-k{K}-connected") for K in (2, 3)}
     assert beyond == connected | {(f"20x20-cells-n{N}", "n12-k3-informed") for N in (4, 6, 8, 10, 12, 14)}
 
@@ -66,7 +66,7 @@ def test_models_are_drawn_from_on_teams_of_their_own_size_and_the_informed_one_p
     whole = experiment(tmp_path)
 
     def names(N, model):
-        return [each.name for each in whole._executions(Scene("cells", N), model)]
+        return [each.name for each in whole.executions(model, model.trained_for(Scene("cells", N)))]
 
     assert names(4, Model(4, 3)) == ["argmax", "stuck,1", "sampled,1"]
     assert names(6, Model(4, 3)) == ["argmax", "stuck,1"]
@@ -92,7 +92,7 @@ def test_only_what_is_missing_is_trained_and_a_training_that_was_stopped_goes_on
         stopped.run()
     assert not whole.is_trained(Model(12, 3))
     first = (run / "metrics.csv").read_text()
-    whole.train()
+    paper.train(whole, Console(quiet=True))
     assert whole.is_trained(Model(12, 3))
     assert (run / "metrics.csv").read_text().startswith(first)
     assert json.loads((run / "config.json").read_text())["num_agents"] == 12
@@ -103,7 +103,7 @@ def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
     whole = experiment(tmp_path)
     for N in (4, 6, 8, 10, 12):
         finish(whole, Model(N, 3), success=0.75)
-    whole.draw()
+    drawn = list(draw(whole))
     text = (tmp_path / "results.md").read_text()
     assert "## Cells, 20 x 20" in text
     assert "90 cases for each size of the team" in text
@@ -114,13 +114,14 @@ def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
     assert "| PIBT* | 0.875 | 0.875 | 0.875 | 0.875 | 0.875 |" in text
     assert "| paper, trained on 10 | 0.965 | 0.952 | 0.925 | 0.898 | 0.854 |" in text
     assert "sampled" not in text
-    assert whole._heat("cells", "argmax")[4, 4] == pytest.approx(0.75)
-    for picture in ("figure2-cells.png", "figure3-cells.png"):
-        assert (tmp_path / picture).read_bytes()[:4] == b"\x89PNG"
+    assert success_rates(whole, "cells", "argmax")[4, 4] == pytest.approx(0.75)
+    assert drawn == [tmp_path / name for name in ("figure2-cells.png", "figure3-cells.png", "results.md")]
+    for picture in drawn[:2]:
+        assert picture.read_bytes()[:4] == b"\x89PNG"
 
 
 def test_the_tables_of_the_docs_are_drawn_from_the_results_beside_them():
     folder = Path(__file__).parents[2] / "docs" / "paper"
-    drawn = "\n".join(Experiment(Options(folder=folder), Console(quiet=True))._tables()) + "\n"
+    drawn = "\n".join(tables(Experiment(Options(folder=folder)))) + "\n"
     assert (folder / "results.md").read_text() == drawn
     assert drawn.count("\n## ") >= 1

@@ -1,0 +1,180 @@
+"""What the paper's experiment consists of, and what of it is done: models, test cases, files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.execution import Execution
+from gnn_policy.precision import Precision
+from mapf_env.generation import MapStyle
+
+Step = Literal["all", "plan", "train", "test", "draw"]
+Kind = Literal["paper", "connected", "informed"]
+
+TEAMS: tuple[int, ...] = (4, 6, 8, 10, 12, 14)
+PAPER = {
+    4: (0.9431, 0.8518, 0.7531, 0.5980, 0.4909, 0.3642),
+    6: (0.9638, 0.9313, 0.8747, 0.7916, 0.7058, 0.6227),
+    8: (0.9676, 0.9442, 0.9140, 0.8547, 0.7842, 0.7042),
+    10: (0.9647, 0.9520, 0.9249, 0.8984, 0.8544, 0.8136),
+    12: (0.9696, 0.9542, 0.9347, 0.9082, 0.8791, 0.8302),
+}
+"""Figure 3 of the paper: success rate, a row for each size of the training teams, a column for each of TEAMS."""
+W = 1.05
+"""Of the expert whose makespans set T_max and whose flowtimes are compared with."""
+
+
+LARGE = tuple((50, N) for N in (20, 40, 60))
+"""Side of the map and size of the team of the longer paper's large maps."""
+LARGEST = max(PAPER)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which part of the experiment to do, and how much of it."""
+
+    step: tyro.conf.Positional[Step] = "all"
+    """"plan" says what is to do and how long it takes; "train", "test", "draw" are the parts of "all"."""
+    folder: Path = Path("runs/paper")
+    """Where models, results and figures go."""
+    train_on: tuple[int, ...] = tuple(PAPER)
+    """Sizes of the training teams."""
+    taps: tuple[int, ...] = (3, 2, 1)
+    """Filter taps K of the models; K = 1 does not communicate."""
+    kinds: tuple[Kind, ...] = ("paper", "connected", "informed")
+    """Models after the "paper"; and of the largest training team those with a radius that grows until the team is
+    "connected", K > 1, and one "informed" by a channel of the cost to go and trained under the PIBT shield, K = 3."""
+    styles: tuple[MapStyle, ...] = ("cells", "walls")
+    """Styles of the test maps, a table each."""
+    rows: tuple[str, ...] = ("argmax", "stuck")
+    """How the policies are executed, as in gnn_policy.evaluate; the informed one under the PIBT shield, which it is
+    trained under."""
+    own_size_rows: tuple[str, ...] = ("sampled",)
+    """Further ways, for figure 2 alone: on teams of the size that a model was trained on."""
+    cases_per_map: int = 50
+    """Test cases on each of 90 maps."""
+    large: bool = True
+    """Test the model of the largest training team on maps of 50x50 as well, where teams have 20, 40 and 60."""
+    precision: Precision = "auto"
+    """In which numbers the policies compute in the tests, as in gnn_policy.train."""
+    threads: int = 1
+    """CPU threads of training, testing and the expert."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """One of the paper's models."""
+
+    num_agents: int
+    taps: int
+    kind: Kind = "paper"
+
+    @property
+    def name(self) -> str:
+        """The name of its run folder."""
+        return f"n{self.num_agents}-k{self.taps}" + (f"-{self.kind}" if self.kind != "paper" else "")
+
+    @property
+    def config(self) -> TrainConfig:
+        """Its settings: the recipe "full", in which a round has as many robot states for each size of the team."""
+        full, N = RECIPES["full"], self.num_agents
+        informed = self.kind == "informed"
+        counts = ("batch_size", "demonstration_steps", "dagger_steps", "fresh_window")
+        return replace(
+            full,
+            policy=replace(
+                full.policy,
+                taps=self.taps,
+                comm_range="connected" if self.kind == "connected" else "fixed",
+                cost_to_go=informed,
+            ),
+            num_agents=N,
+            shield="pibt" if informed else "idle",
+            **{name: getattr(full, name) * LARGEST // N for name in counts},
+        )
+
+    @property
+    def exists(self) -> bool:
+        """Whether the experiment has it."""
+        least = {"paper": 1, "connected": 2, "informed": 3}[self.kind]
+        return self.taps >= least and (self.kind == "paper" or self.num_agents == LARGEST)
+
+    @property
+    def general(self) -> bool:
+        """Whether it is tested on every size of the team."""
+        without_communication = self == Model(LARGEST, 1)
+        return without_communication or (self.taps == 3 and self.kind != "connected")
+
+    def trained_for(self, scene: Scene) -> bool:
+        """Whether the teams are of the size of its training."""
+        return scene.size == 20 and scene.num_agents == self.num_agents
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The test cases of one table."""
+
+    style: MapStyle
+    num_agents: int
+    size: int = 20
+
+    @property
+    def name(self) -> str:
+        """The name of its results' folder."""
+        return f"{self.size}x{self.size}-{self.style}-n{self.num_agents}"
+
+
+class Experiment:
+    """The experiment as its options define it, and what is done of it."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.rows = [Execution.parse(name).name for name in options.rows]
+        self.own_size_rows = [Execution.parse(name).name for name in options.own_size_rows]
+        self.models = [Model(N, K, kind) for kind in options.kinds for K in options.taps for N in options.train_on]
+        self.models = [model for model in self.models if model.exists]
+        self.scenes = [Scene(style, N) for style in options.styles for N in TEAMS]
+        if options.large:
+            self.scenes += [Scene(style, N, size) for style in options.styles for size, N in LARGE]
+
+    def pairs(self) -> Iterator[tuple[Scene, Model]]:
+        """Which model is tested where."""
+        for scene in self.scenes:
+            for model in self.models:
+                large = model == Model(LARGEST, 3) and scene.size == 50
+                if large or (scene.size == 20 and model.general) or model.trained_for(scene):
+                    yield scene, model
+
+    def executions(self, model: Model, own_size: bool) -> list[Execution]:
+        """How a model is executed, on teams of the size it was trained on or of others."""
+        shield = ",pibt" if model.kind == "informed" else ""
+        names = (*self.options.rows, *(self.options.own_size_rows if own_size else ()))
+        return [Execution.parse(name + shield) for name in names]
+
+    def run_of(self, model: Model) -> Path:
+        """The run folder of a model."""
+        return self.options.folder / model.name
+
+    def is_trained(self, model: Model) -> bool:
+        """Whether its training has come to its end."""
+        metrics = self.run_of(model) / "metrics.csv"
+        return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.epochs
+
+    def result(self, scene: Scene, player: str) -> Path:
+        """The file of what a model, or the "baselines", did on the cases of a scene."""
+        return self.options.folder / "results" / scene.name / f"{player}.json"
+
+    def row(self, scene: Scene, player: str, row: str) -> dict[str, Any] | None:
+        """What a player did there when executed in one way, if that is known."""
+        path = self.result(scene, player)
+        if not path.exists():
+            return None
+        rows = {each["name"]: each for each in json.loads(path.read_text())["rows"]}
+        return rows.get(row)
