@@ -3,6 +3,14 @@
 Importing it registers the environment as `mapf/grid-v0` with PettingZoo.
 """
 
+import importlib.util
+
+if importlib.util.find_spec("mapf_env._native") is None:
+    raise ImportError(
+        f"{__path__[0]} has no compiled extension, it is a source tree: install it in place with `pip install -e .` or "
+        "start Python in another folder, where it finds the installed package"
+    )
+
 import pettingzoo
 
 from mapf_env.ascii_map import parse_instance, parse_map

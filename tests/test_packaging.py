@@ -48,6 +48,17 @@ def test_importing_again_registers_nothing_twice() -> None:
     assert run_python(code) == "mapf/grid-v0 mapf/grid-v0"
 
 
+def test_a_source_tree_that_was_not_built_says_so(tmp_path: Path) -> None:
+    package = tmp_path / "mapf_env"
+    package.mkdir()
+    (package / "__init__.py").write_text((ROOT / "mapf_env" / "__init__.py").read_text())
+    command = [sys.executable, "-S", "-c", "import mapf_env"]  # -S: without the packages that are installed
+    failed = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert failed.returncode == 1
+    assert f"ImportError: {package} has no compiled extension" in failed.stderr
+    assert "`pip install -e .`" in failed.stderr
+
+
 @pytest.mark.parametrize("package", ["mapf_env", "experts", "gnn_policy"])
 def test_type_checkers_find_our_types(package: str) -> None:
     spec = importlib.util.find_spec(package)  # without importing: gnn_policy needs its extra
