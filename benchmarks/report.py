@@ -102,7 +102,7 @@ class Run:
         """Number of robots and mean of a measure, where there is one."""
         for size, table in self.results.items():
             for found in table["rows"]:
-                if found["name"].removesuffix(",cost-to-go*") == row and found[measure]["mean"] is not None:
+                if found["name"].removesuffix("*") == row and found[measure]["mean"] is not None:
                     yield int(size), found[measure]["mean"]
 
 

@@ -11,6 +11,7 @@ import safetensors
 import safetensors.torch
 import torch
 
+from gnn_policy.config import TrainConfig
 from gnn_policy.network import DecentralizedPolicy, PolicyConfig
 from mapf_env.files import PathLike, replacing
 
@@ -83,6 +84,12 @@ def load(path: PathLike = PACKAGED) -> DecentralizedPolicy:
 def about(path: PathLike) -> dict[str, str]:
     """The notes that were saved with the policy at `path`; raises as `load` does."""
     return _read(path)[0]
+
+
+def trained_with(path: PathLike) -> TrainConfig:
+    """The settings of its training as the policy at `path` tells them, else the defaults; raises as `load` does."""
+    settings = about(path).get("training")
+    return TrainConfig() if settings is None else TrainConfig.from_json(settings)
 
 
 def fingerprint(policy: DecentralizedPolicy) -> str:

@@ -236,6 +236,20 @@ def _collector(
     return Collector([make_env] * players, mixture, backend=backend, **settings, **own)
 
 
+def teams_side_by_side(config: TrainConfig, ranks: Ranks) -> int:
+    """How many teams this process plays at a time.
+
+    Raises:
+        ValueError: If processes, or the collectors of a process, cannot share them evenly.
+    """
+    teams = ranks.share("rollout_teams", config.rollout_teams)
+    if teams % config.collectors:
+        raise ValueError(
+            f"rollout_teams of a process must be a multiple of its {config.collectors} collectors, got {teams}"
+        )
+    return teams
+
+
 class Aggregator:
     """Collects demonstrations round by round through a TorchRL collector."""
 
@@ -248,9 +262,7 @@ class Aggregator:
         ranks: Ranks = Ranks(),
     ) -> None:
         self._config, self._teacher, self._rank = config, teacher, ranks.rank
-        teams, players = ranks.share("rollout_teams", config.rollout_teams), config.collectors
-        if teams % players:
-            raise ValueError(f"rollout_teams of a process must be a multiple of its {players} collectors, got {teams}")
+        teams, players = teams_side_by_side(config, ranks), config.collectors
         self._mixture = Mixture(policy, teacher, config)
         self._mixture.begin(beta=1.0, seed=0)
         make_env = functools.partial(

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from gnn_policy import checkpoint
 from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
-from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.results import examine
 from mapf_env.generation import MapStyle
@@ -27,7 +26,9 @@ class Command:
     What is not given is as the policy was trained. Results of other settings are never overwritten.
     """
 
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = checkpoint.PACKAGED
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN", help_behavior_hint="(default: n12)")] = (
+        checkpoint.PACKAGED
+    )
     """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     num_agents: tuple[int, ...] = ()
     """Team sizes N, one table for each."""
@@ -35,7 +36,8 @@ class Command:
     """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled" or "stuck"
     (drawn by stuck robots and their neighbours); for the latter two a temperature; the shield, "idle" or "pibt"; who
     hears whom, "fixed" or "connected" (the radius grows until the team is connected); edge weights, "binary" or
-    "distance". If not given: argmax, stuck and sampled, under the shield of training."""
+    "distance". Shield, range and weights are those of training where a row does not say. If not given: argmax, stuck
+    and sampled."""
     split: Literal["validation", "test"] = "test"
     """Which maps: "validation" to choose a row by, "test" to report it."""
     maps: int | None = None
@@ -64,7 +66,7 @@ class Command:
     of failure, then the next worst."""
     out: Path | None = None
     """Folder for results.json and pictures; if not given, evaluation/ in the run folder or beside the file, and
-    in the working folder for the policy that comes with the package."""
+    evaluation/NAME in the working folder for a policy that comes with the package."""
     threads: int = 0
     """CPU threads; 0 takes all that the process may use."""
 
@@ -76,7 +78,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.evaluate"
         )
         policy = checkpoint.load(command.run)
-        variants = None if command.rows is None else [Execution.parse(row) for row in command.rows]
         names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         prefix = "validation_" if command.split == "validation" else ""
@@ -84,8 +85,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             given[f"{command.split}_maps"] = command.maps
         if command.cases_per_map is not None:
             given[f"{prefix}cases_per_map"] = command.cases_per_map
-        config = replace(_trained_with(command.run), **given)
-        folder = command.out or _home(command.run) / "evaluation"
+        config = replace(checkpoint.trained_with(command.run), **given)
+        variants = None if command.rows is None else [Execution.parse(row, config.shield) for row in command.rows]
+        folder = command.out or _home(command.run)
         folder.mkdir(parents=True, exist_ok=True)
         threads = cpu_threads(command.threads)
         torch.set_num_threads(threads)
@@ -103,14 +105,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _home(run: Path) -> Path:
-    folder = checkpoint.file_of(run).parent
-    return Path() if folder == checkpoint.WEIGHTS else folder
-
-
-def _trained_with(run: Path) -> TrainConfig:
-    """The settings that a checkpoint says it was trained with."""
-    settings = checkpoint.about(run).get("training")
-    return TrainConfig() if settings is None else TrainConfig.from_json(settings)
+    file = checkpoint.file_of(run)
+    return Path("evaluation", file.stem) if file.parent == checkpoint.WEIGHTS else file.parent / "evaluation"
 
 
 if __name__ == "__main__":

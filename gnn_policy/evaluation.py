@@ -134,7 +134,7 @@ def compare(
         The rows, those of the variants first, and what the policy did in each variant.
     """
     rows, played = [], []
-    mark = ",cost-to-go*" if policy.config.cost_to_go else ""
+    mark = "*" if policy.config.cost_to_go else ""  # that channel needs the map
     for variant in variants:
         progress(variant.name)
         played.append(rollout(policy, exam.instances, seed=seed, max_steps=exam.max_steps, **asdict(variant)))

@@ -92,8 +92,12 @@ class Execution:
         return ",".join([*words, *(each for each in (self.comm_range, self.comm_weights) if each)])
 
     @staticmethod
-    def parse(text: str) -> Execution:
+    def parse(text: str, shield: Shield = "idle") -> Execution:
         """The variant of the given name, its words in any order.
+
+        Args:
+            text: The words.
+            shield: Which shield it has if no word names one.
 
         Raises:
             ValueError: If a word is unknown or contradicts another.
@@ -106,7 +110,7 @@ class Execution:
             given[option] = value
         if "temperature" in given and not given.get("sample"):
             raise ValueError(f"the variant {text!r} has a temperature but draws nothing: say sampled or stuck")
-        return Execution(**given)
+        return Execution(**{"shield": shield, **given})
 
 
 _WORD_OF_SAMPLE = {False: "argmax", True: "sampled", "stuck": "stuck"}

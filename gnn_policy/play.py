@@ -33,7 +33,7 @@ class Command:
     """A map (.map) in the MovingAI format, a scenario (.scen) beside its map, or a set of instances (.json)."""
     agents: int | None = None
     """How many robots: placed at random on a map, else the first ones of the file (all of them if not given)."""
-    run: Path = checkpoint.PACKAGED
+    run: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: n12)")] = checkpoint.PACKAGED
     """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     map: Path | None = None
     """The map of a scenario, if it does not lie beside it."""
@@ -58,7 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.play"
         )
         torch.set_num_threads(cpu_threads(command.threads))
-        policy, execution = checkpoint.load(command.run), Execution.parse(command.row)
+        policy = checkpoint.load(command.run)
+        execution = Execution.parse(command.row, checkpoint.trained_with(command.run).shield)
         instance = load_problem(
             command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed
         )

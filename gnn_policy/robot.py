@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,11 +36,14 @@ class Message:
         """What `to_bytes` wrote.
 
         Raises:
-            ValueError: If the length is not that of a message.
+            ValueError: If the length is not that of a message, or a feature is not a finite number.
         """
         if len(data) % 4 != 1 or data[0] > 1:
             raise ValueError(f"{len(data)} bytes are no message: it has one byte, 0 or 1, and 4 for each feature")
-        return Message(np.frombuffer(data, "<f4", offset=1).astype(np.float32), bool(data[0]))
+        features = np.frombuffer(data, "<f4", offset=1).astype(np.float32)
+        if not np.isfinite(features).all():
+            raise ValueError("a message with features that are not finite is damaged: leave it out as if it were lost")
+        return Message(features, bool(data[0]))
 
 
 class Robot:
@@ -53,6 +56,9 @@ class Robot:
     The graph shift D^-1/2 A D^-1/2 needs the degree of each neighbour. A robot knows its own, the sum of the weights of
     the links on which it hears; it divides what it sends by the degree's root, and what it has received likewise, so
     degrees travel inside the features and cost no byte.
+
+    A message that is lost adds nothing to what the robot gathers in that round. Messages carry neither names nor the
+    number of the round: the radio says who sent one, and delivers it in the round in which it was sent or not at all.
 
     Args:
         policy: The policy; its weights are shared, and it is put into evaluation mode.
@@ -73,7 +79,11 @@ class Robot:
             )
         self._policy, self._filter, self._execution = policy.eval(), policy.filter, execution
         self._seed = np.array(seed, np.uint64)
-        self._track: deque[tuple[int, int]] = deque(maxlen=STUCK_MEMORY)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all steps: the next is the first one of another case."""
+        self._track: deque[tuple[int, ...]] = deque(maxlen=STUCK_MEMORY)
         self._time = -1
         self._links: dict[Hashable, float] = {}
         self._gathered: list[Features] = []
@@ -89,14 +99,14 @@ class Robot:
         """The neighbours that it hears in this step and the weights of their links."""
         return self._links
 
-    def begin(self, view: npt.NDArray[Any], links: Mapping[Hashable, float], cell: tuple[int, int]) -> None:
-        """Start a step.
+    def begin(self, view: npt.NDArray[Any], links: Mapping[Hashable, float], cell: Sequence[int]) -> None:
+        """Start a step; what is left of another is dropped.
 
         Args:
             view: (C, S, S) what it sees, as `mapf_env` shows it.
             links: The weights of the links to the neighbours that it hears, by whatever names they have: 1, or 1 /
                 distance for a policy whose comm_weights are "distance".
-            cell: Where it stands, in any frame that stays the same, as its odometry's.
+            cell: Row and column of where it stands, in any frame that stays the same, as its odometry's.
 
         Raises:
             ValueError: If the view is not one that the policy reads, or a weight is not positive.
@@ -108,10 +118,10 @@ class Robot:
             extracted = self._policy.extract(self._tensor(view)[None])[0].cpu().numpy()
         self._time += 1
         self._links, self._gathered = dict(links), [extracted]
-        centre = view.shape[-1] // 2
+        place, centre = tuple(int(each) for each in cell), view.shape[-1] // 2
         on_goal = bool(view[1, centre, centre])
-        self._stuck = self._alarmed = not on_goal and cell in self._track
-        self._track.append(cell)
+        self._stuck = self._alarmed = not on_goal and place in self._track
+        self._track.append(place)
 
     @property
     def message(self) -> Message:
@@ -121,16 +131,15 @@ class Robot:
         return Message(self._scaled(self._gathered[-1]), self._stuck)
 
     def hear(self, messages: Mapping[Any, Message]) -> None:
-        """Take the messages that the neighbours sent in this round.
+        """Take the messages of this round that came, by the names of the links.
 
         Raises:
-            ValueError: If they are not those of the links, or of another policy.
+            ValueError: If one is of no link, or of another policy.
             RuntimeError: If the rounds of the step are over.
         """
         own = self.message.features
-        if messages.keys() != self._links.keys():
-            odd = next(iter(messages.keys() ^ self._links.keys()))
-            raise ValueError(f"expected one message on each link, and no other; look at {odd!r}")
+        if strange := messages.keys() - self._links.keys():
+            raise ValueError(f"got a message of {next(iter(strange))!r}, to whom begin() was given no link")
         total = np.zeros_like(own)
         for name, message in messages.items():
             if message.features.shape != own.shape:
@@ -151,14 +160,21 @@ class Robot:
             filtered = self._filter.mix(self._tensor(np.concatenate(self._gathered)))
             return self._policy.decide(filtered).cpu().numpy()
 
-    def act(self) -> int:
-        """The move that it wants, 0..4; the world's shield has the last word.
+    def values(self) -> Features:
+        """(5,) what each move is worth to it: logits and the noise of its draws. The PIBT shield heeds their order.
 
         Raises:
             RuntimeError: If rounds are missing.
         """
-        values = self._execution.values(self.logits(), np.array(self._alarmed), self._seed, self._time)
-        return int(values.argmax())
+        return self._execution.values(self.logits(), np.array(self._alarmed), self._seed, self._time)
+
+    def act(self) -> int:
+        """The move that it wants, 0..4, that of the greatest value; the world's shield has the last word.
+
+        Raises:
+            RuntimeError: If rounds are missing.
+        """
+        return int(self.values().argmax())
 
     def _scaled(self, features: Features) -> Features:
         degree = sum(self._links.values())

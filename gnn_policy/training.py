@@ -35,7 +35,7 @@ from gnn_policy import checkpoint, evaluation
 from gnn_policy.cases import Split, make_cases
 from gnn_policy.command_line import cpu_threads
 from gnn_policy.config import TrainConfig
-from gnn_policy.dagger import Aggregator, Teacher
+from gnn_policy.dagger import Aggregator, Teacher, teams_side_by_side
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.imitation import ImitationLoss
 from gnn_policy.learning_curve import Round, draw_learning_curve
@@ -134,7 +134,7 @@ class Training:
     ) -> None:
         self.config, self.folder, self.progress, self.ranks = config, folder, progress, ranks
         ranks.share("batch_size", config.batch_size)
-        ranks.share("rollout_teams", config.rollout_teams)
+        teams_side_by_side(config, ranks)
         self.threads = config.threads or max(cpu_threads(0) // ranks.local_count, 1)
         torch.set_num_threads(self.threads)
         torch.manual_seed(config.seed)

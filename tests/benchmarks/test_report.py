@@ -30,7 +30,7 @@ def run(tmp_path: Path) -> Path:
             "cases": 90,
             "rows": [
                 {
-                    "name": name + ",cost-to-go*",
+                    "name": name + "*",
                     "success_rate": estimate(success),
                     "flowtime_increase": estimate(0.1),
                 }

@@ -65,6 +65,16 @@ def test_what_is_not_given_is_as_in_training(file, monkeypatch):
     assert folder == file.parent / "evaluation"
 
 
+def test_rows_of_a_policy_of_the_package_play_under_the_shield_of_its_training(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    _, folder, how = examined(monkeypatch, "n12-informed", "--rows", "argmax", "stuck,idle")
+    assert how["variants"] == [Execution(shield="pibt"), Execution(sample="stuck")]
+    assert str(folder) == "evaluation/n12-informed"
+    _, folder, how = examined(monkeypatch, "--rows", "argmax")
+    assert how["variants"] == [Execution()]
+    assert str(folder) == "evaluation/n12"
+
+
 @pytest.mark.parametrize("split", ["test", "validation"])
 def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path, split):
     config, folder, how = examined(

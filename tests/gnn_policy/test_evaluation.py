@@ -163,7 +163,7 @@ def test_a_policy_that_sees_the_cost_to_go_is_marked_as_one_that_knows_the_map(c
     exam = compared[0]
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2, cost_to_go=True))
     rows, _ = evaluation.compare(exam, policy, VARIANTS[:1])
-    assert rows[0].name == "argmax,cost-to-go*"
+    assert rows[0].name == "argmax*"
 
 
 def test_pibt_is_measured_like_everybody(compared):

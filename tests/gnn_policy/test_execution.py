@@ -30,6 +30,12 @@ def test_names_round_trip_with_their_words_in_any_order(variant, random):
         assert again == variant
 
 
+def test_a_name_without_a_shield_has_the_one_that_is_given():
+    assert Execution.parse("stuck", "pibt") == Execution(sample="stuck", shield="pibt")
+    assert Execution.parse("stuck,idle", "pibt") == Execution(sample="stuck")
+    assert Execution.parse("stuck") == Execution(sample="stuck")
+
+
 def test_different_variants_have_different_names():
     choices = itertools.product(
         [False, True, "stuck"], [0.5, 1.0], ["idle", "pibt"], ["fixed", "connected", None], ["binary", "distance", None]

@@ -87,6 +87,14 @@ def test_every_option_reaches_the_rollout(home, monkeypatch):
     assert asked == [{"seed": 3, "max_steps": limit, **asdict(row)} for row, limit in zip(rows, limits, strict=True)]
 
 
+def test_a_policy_plays_under_the_shield_of_its_training(home, monkeypatch):
+    asked = []
+    monkeypatch.setattr(play, "rollout", lambda *given, **how: asked.append(how["shield"]) or rollout(*given, **how))
+    for run in ("n12-informed", "n12"):
+        play.main(["own.scen", "--run", run, "--threads", "1"])
+    assert asked == ["pibt", "idle"]
+
+
 def test_a_scenario_elsewhere_takes_the_first_robots_and_a_map(home):
     played("elsewhere/far.scen", "--map", "own.map", "--agents", "2", "--max-steps", "3")
     assert shown(home / "far.html")["scenes"][0]["goals"] == load_scen("own.scen", 2).goals.tolist()

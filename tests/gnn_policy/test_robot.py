@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mapf_env
-from gnn_policy import DecentralizedPolicy, Execution, Message, PolicyConfig, Robot, rollout
+from gnn_policy import DecentralizedPolicy, Execution, Message, PolicyConfig, Robot, load, rollout
 from gnn_policy.cases import make_cases
 from gnn_policy.execution import robot_seeds
 from gnn_policy.rollout import Teams
@@ -119,6 +119,54 @@ def test_messages_survive_the_wire_and_nothing_else_is_taken_for_one():
     for wrong in (b"", data[:-1], data + b"\0", b"\7" + data[1:]):
         with pytest.raises(ValueError, match="no message"):
             Message.from_bytes(wrong)
+    with pytest.raises(ValueError, match="not finite"):
+        Message.from_bytes(data[:1] + b"\xff" * 12)
+
+
+def test_what_is_lost_adds_nothing():
+    """Of two neighbours one is not heard: the sums have the other's share alone, over the degree of both."""
+    policy = seeded_policy(taps=2)
+    robot, heard = Robot(policy), Message(np.arange(16, dtype=np.float32), False)
+    view = np.random.default_rng(0).random((3, 7, 7), dtype=np.float32)
+    robot.begin(view, {"a": 1.0, "b": 1.0}, (0, 0))
+    robot.hear({"a": heard})
+    lost = Message(np.zeros(16, np.float32), False)
+    other = Robot(policy)
+    other.begin(view, {"a": 1.0, "b": 1.0}, (0, 0))
+    other.hear({"a": heard, "b": lost})
+    assert np.array_equal(robot.logits(), other.logits())
+    other.begin(view, {"a": 1.0}, (0, 0))
+    other.hear({"a": heard})
+    assert not np.array_equal(robot.logits(), other.logits())
+
+
+def test_a_robot_that_is_reset_begins_another_case():
+    policy = seeded_policy(taps=1)
+    view, cell = np.zeros((3, 7, 7), np.float32), np.array([2, 3])
+    robot = Robot(policy, Execution(sample="stuck"), seed=4)
+
+    def step():
+        robot.begin(view, {}, cell)
+        return robot.values().tolist()
+
+    first, second = step(), step()
+    assert first != second  # it is stuck, so it draws
+    assert robot.act() == int(np.argmax(second))
+    robot.reset()
+    assert [step(), step()] == [first, second]
+
+
+@pytest.mark.parametrize("name", ["n12", "n12-informed"])
+def test_robots_alone_do_what_the_policies_of_the_package_do(name):
+    policy = load(name)
+    env = mapf_env.parallel_env(num_agents=12, extra_channels=("cost_to_go",) if policy.config.cost_to_go else ())
+    seen, _ = env.reset(seed=2)
+    views, graph = (np.stack([each[key] for each in seen.values()]) for key in ("fov", "graph"))
+    robots = [Robot(policy) for _ in range(12)]
+    assert one_step(robots, views, graph, env.positions) == {513}
+    with torch.no_grad():
+        team = policy(torch.from_numpy(views)[None], torch.from_numpy(graph)[None])[0].numpy()
+    np.testing.assert_allclose(np.stack([robot.logits() for robot in robots]), team, rtol=1e-5, atol=1e-5)
 
 
 def test_a_robot_refuses_what_is_out_of_turn_or_does_not_fit():
@@ -135,8 +183,8 @@ def test_a_robot_refuses_what_is_out_of_turn_or_does_not_fit():
     with pytest.raises(RuntimeError, match="0 of 1 rounds"):
         robot.act()
     fitting = robot.message
-    for wrong in ({}, {"b": fitting}, {"a": fitting, "b": fitting}):
-        with pytest.raises(ValueError, match="one message on each link"):
+    for wrong in ({"b": fitting}, {"a": fitting, "b": fitting}):
+        with pytest.raises(ValueError, match="a message of 'b', to whom"):
             robot.hear(wrong)
     with pytest.raises(ValueError, match=r"'a' sent \(3,\) features"):
         robot.hear({"a": Message(np.zeros(3, np.float32), False)})

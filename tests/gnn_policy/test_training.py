@@ -330,6 +330,7 @@ def test_settings_that_do_not_fit_leave_no_folder_behind(tmp_path):
         replace(CONFIG, num_agents=40),
         replace(CONFIG, device="abacus"),
         replace(CONFIG, teacher="nobody"),
+        replace(CONFIG, backend="process", collectors=3, rollout_teams=16),
         replace(CONFIG, policy=PolicyConfig(encoder="released", fov_radius=2)),
     ):
         with pytest.raises(ValueError, match=r"\w+ \w+"):
