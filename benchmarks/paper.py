@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 
 import torch
@@ -26,13 +26,14 @@ from rich.console import Console
 from rich.progress import Progress
 
 from gnn_policy import checkpoint, evaluation
+from gnn_policy.command_line import mistakes_in_one_line
 from gnn_policy.config import RECIPES
 from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
-from gnn_policy.precision import autocast
+from gnn_policy.precision import autocast, resolved
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.rollout import rollout
-from gnn_policy.training import Training, split_cases
+from gnn_policy.training import RunLockedError, Training, split_cases
 from mapf_env.files import write_whole
 from paper_experiment import Experiment, Model, Options, Scene, W
 from paper_figures import draw
@@ -44,76 +45,120 @@ STEPS = {20: 36, 50: 90}
 def plan(experiment: Experiment, console: Console) -> None:
     """Say what is to do and how long it takes on this machine."""
     torch.set_num_threads(experiment.options.threads)
-    untrained = [model for model in experiment.models if not experiment.is_trained(model)]
-    hours = sum(_training_seconds(model) for model in untrained) / 3600
-    console.print(f"{len(experiment.models) - len(untrained)} of {len(experiment.models)} models are trained", end="; ")
-    console.print(f"the others take about {hours:.1f} hours with {experiment.options.threads} thread(s)")
-    pairs = list(experiment.pairs())
-    untested = [pair for pair in pairs if not experiment.result(pair[0], pair[1].name).exists()]
-    hours = sum(_test_seconds(experiment, *pair) for pair in untested) / 3600
-    console.print(f"{len(pairs) - len(untested)} of {len(pairs)} tests are done", end="; ")
-    console.print(f"the others take about {hours:.1f} hours")
+    untrained, untested = experiment.untrained(), list(_untested(experiment))
+    hours = sum(map(_training_seconds, untrained)) / 3600
+    threads = experiment.options.threads
+    console.print(f"to train: {len(untrained)} models, about {hours:.1f} hours with {threads} thread(s)")
+    hours = sum(_test_seconds(experiment, scene, model) for scene, model in untested if model) / 3600
+    console.print(f"to test: {len(untested)} models and baselines, about {hours:.1f} hours for the models")
 
 
 def train(experiment: Experiment, console: Console) -> None:
-    """Train what is not trained; each model resumes by itself."""
-    for model in experiment.models:
-        if experiment.is_trained(model):
-            continue
+    """Train what is not trained and not being trained by another process; each model resumes by itself."""
+    for model in experiment.untrained():
         console.rule(f"training {model.name}")
         config = replace(model.config, threads=experiment.options.threads)
         with TrainingProgress(config.epochs, console) as progress:
-            Training(config, experiment.run_of(model), progress).run()
+            try:
+                training = Training(config, experiment.run_of(model), progress)
+            except RunLockedError:
+                console.print("another process is training it")
+                continue
+            training.run()
 
 
 def test(experiment: Experiment, console: Console) -> None:
     """Play every trained model on the test cases; results that exist are kept."""
     torch.set_num_threads(experiment.options.threads)
     todo: dict[Scene, list[Model | None]] = {}
-    for scene in experiment.scenes:
-        if not experiment.result(scene, "baselines").exists():
-            todo.setdefault(scene, []).append(None)
-    for scene, model in experiment.pairs():
-        if experiment.is_trained(model) and not experiment.result(scene, model.name).exists():
-            todo.setdefault(scene, []).append(model)
+    for scene, model in _untested(experiment):
+        if model is not None and experiment.policy_of(model) is None:
+            continue
+        todo.setdefault(scene, []).append(model)
     with Progress(console=console) as progress:
         task = progress.add_task("", total=sum(map(len, todo.values())))
-        for scene, players in todo.items():
+        for scene, models in todo.items():
             progress.update(task, description=f"{scene.name}: expert")
-            exam = _exam(experiment.options, scene)
-            for player in players:
-                progress.update(task, description=f"{scene.name}: {player.name if player else 'baselines'}")
+            exam = _exam(experiment, scene)
+            for model in models:
+                progress.update(task, description=f"{scene.name}: {_name(model)}")
                 rows, failures = (
-                    (evaluation.baselines(exam), {}) if player is None else _play(experiment, scene, player, exam)
+                    (evaluation.baselines(exam), {}) if model is None else _play(experiment, scene, model, exam)
                 )
                 result = {
-                    "cases_per_map": experiment.options.cases_per_map,
+                    "settings": _settings(experiment, scene, model),
                     **evaluation.as_json(rows, exam),
                     "failures": failures,
                 }
-                path = experiment.result(scene, player.name if player else "baselines")
+                path = experiment.result(scene, _name(model))
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(path, json.dumps(result, indent=2) + "\n")
                 progress.advance(task)
 
 
-def _exam(options: Options, scene: Scene) -> evaluation.Exam:
+def _untested(experiment: Experiment) -> Iterator[tuple[Scene, Model | None]]:
+    """Where baselines (None) and models are still to be played.
+
+    Raises:
+        FileExistsError: If there are results of other settings.
+    """
+    for scene, model in [*((scene, None) for scene in experiment.scenes), *experiment.pairs()]:
+        path = experiment.result(scene, _name(model))
+        if not path.exists():
+            yield scene, model
+            continue
+        if model is not None and experiment.policy_of(model) is None:
+            continue  # its results came without it
+        known, settings = json.loads(path.read_text()), _settings(experiment, scene, model)
+        differ = [name for name in settings if known["settings"].get(name) != settings[name]]
+        if differ:
+            raise FileExistsError(
+                f"{path} has results of other settings ({', '.join(differ)}): give another --folder, or delete it"
+            )
+
+
+def _settings(experiment: Experiment, scene: Scene, model: Model | None) -> dict[str, object]:
+    """All that a result depends on but the scene; the baselines play no policy."""
+    settings: dict[str, object] = {
+        "cases_per_map": experiment.cases_per_map(scene),
+        "w": W,
+        "timeout": RECIPES["full"].timeout,
+    }
+    if model is not None:
+        settings["rows"] = [each.name for each in experiment.executions(model, model.trained_for(scene))]
+        settings["precision"] = resolved(experiment.options.precision, torch.device("cpu"))
+        settings["policy"] = checkpoint.fingerprint(_load(experiment, model))
+    return settings
+
+
+def _name(model: Model | None) -> str:
+    return model.name if model else "baselines"
+
+
+def _load(experiment: Experiment, model: Model) -> DecentralizedPolicy:
+    path = experiment.policy_of(model)
+    if path is None:
+        raise FileNotFoundError(f"{model.name} is not trained")
+    return checkpoint.load(path)
+
+
+def _exam(experiment: Experiment, scene: Scene) -> evaluation.Exam:
     config = replace(
         RECIPES["full"],
         styles=(scene.style,),
         height=scene.size,
         width=scene.size,
-        cases_per_map=options.cases_per_map,
+        cases_per_map=experiment.cases_per_map(scene),
     )
     cases = split_cases(config, "test", scene.num_agents)
-    return evaluation.Exam.prepare(cases, w=W, timeout=config.timeout, threads=options.threads)
+    return evaluation.Exam.prepare(cases, w=W, timeout=config.timeout, threads=experiment.options.threads)
 
 
 def _play(
     experiment: Experiment, scene: Scene, model: Model, exam: evaluation.Exam
 ) -> tuple[list[evaluation.Score], dict[str, dict[Failure, int]]]:
     """A row for each way to execute the model, and how its teams failed."""
-    policy, rows, failures = checkpoint.load(experiment.run_of(model)), [], {}
+    policy, rows, failures = _load(experiment, model), [], {}
     for execution in experiment.executions(model, model.trained_for(scene)):
         with autocast(experiment.options.precision, torch.device("cpu")):
             played = rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(execution))
@@ -147,7 +192,7 @@ def _test_seconds(experiment: Experiment, scene: Scene, model: Model) -> float:
     graph = torch.zeros(64, scene.num_agents, scene.num_agents)
     with torch.inference_mode(), autocast(experiment.options.precision, fov.device):
         each = _seconds(lambda: policy(fov, graph), times=2) / 64
-    cases = model.config.test_maps * experiment.options.cases_per_map
+    cases = model.config.test_maps * experiment.cases_per_map(scene)
     return 1.25 * each * cases * STEPS[scene.size] * len(experiment.executions(model, model.trained_for(scene)))
 
 
@@ -162,16 +207,17 @@ def _seconds(action: Callable[[], object], times: int = 20) -> float:
 
 def main(options: Options) -> None:
     """Do the chosen part."""
-    experiment, console = Experiment(options), Console()
-    if options.step in ("all", "plan"):
-        plan(experiment, console)
-    if options.step in ("all", "train"):
-        train(experiment, console)
-    if options.step in ("all", "test"):
-        test(experiment, console)
-    if options.step in ("all", "draw"):
-        for path in draw(experiment):
-            console.print(path, highlight=False)
+    with mistakes_in_one_line():
+        experiment, console = Experiment(options), Console()
+        if options.step in ("all", "plan"):
+            plan(experiment, console)
+        if options.step in ("all", "train"):
+            train(experiment, console)
+        if options.step in ("all", "test"):
+            test(experiment, console)
+        if options.step in ("all", "draw"):
+            for path in draw(experiment):
+                console.print(path, highlight=False)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import tyro
 
+from gnn_policy.checkpoint import WEIGHTS
 from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.precision import Precision
@@ -58,10 +59,14 @@ class Options:
     trained under."""
     own_size_rows: tuple[str, ...] = ("sampled",)
     """Further ways, for figure 2 alone: on teams of the size that a model was trained on."""
+    packaged: bool = False
+    """Test the policies that come with the package, in place of those that were trained in the folder."""
     cases_per_map: int = 50
     """Test cases on each of 90 maps."""
     large: bool = True
     """Test the model of the largest training team on maps of 50x50 as well, where teams have 20, 40 and 60."""
+    large_cases_per_map: int = 10
+    """Test cases on each of them."""
     precision: Precision = "auto"
     """In which numbers the policies compute in the tests, as in gnn_policy.train."""
     threads: int = 1
@@ -135,6 +140,8 @@ class Experiment:
     """The experiment as its options define it, and what is done of it."""
 
     def __init__(self, options: Options) -> None:
+        if min(options.taps, default=0) < 1 or not options.train_on:
+            raise ValueError("give at least one of --taps, 1 or more, and one of --train-on")
         self.options = options
         self.rows = [Execution.parse(name).name for name in options.rows]
         self.own_size_rows = [Execution.parse(name).name for name in options.own_size_rows]
@@ -162,10 +169,25 @@ class Experiment:
         """The run folder of a model."""
         return self.options.folder / model.name
 
+    def policy_of(self, model: Model) -> Path | None:
+        """What `gnn_policy.load` reads of a model that can be tested."""
+        if self.options.packaged:
+            file = WEIGHTS / f"{model.name.replace('-k3', '')}.safetensors"
+            return file if file.exists() else None
+        return self.run_of(model) if self.is_trained(model) else None
+
+    def untrained(self) -> list[Model]:
+        """The models that are to be trained."""
+        return [] if self.options.packaged else [each for each in self.models if not self.is_trained(each)]
+
     def is_trained(self, model: Model) -> bool:
         """Whether its training has come to its end."""
         metrics = self.run_of(model) / "metrics.csv"
         return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.epochs
+
+    def cases_per_map(self, scene: Scene) -> int:
+        """Test cases on each map of a scene."""
+        return self.options.cases_per_map if scene.size == 20 else self.options.large_cases_per_map
 
     def result(self, scene: Scene, player: str) -> Path:
         """The file of what a model, or the "baselines", did on the cases of a scene."""

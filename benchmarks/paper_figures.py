@@ -27,7 +27,10 @@ MEASURES = {
 
 def draw(experiment: Experiment) -> Iterator[Path]:
     """Figures 2 and 3 and all tables of what has been tested."""
+    experiment.options.folder.mkdir(parents=True, exist_ok=True)
     for style in experiment.options.styles:
+        if not any(experiment.options.folder.glob(f"results/*-{style}-*/*.json")):
+            continue
         for name, picture in (("figure2", _figure2), ("figure3", _figure3)):
             figure = picture(experiment, style)
             path = experiment.options.folder / f"{name}-{style}.png"

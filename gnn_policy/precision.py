@@ -15,8 +15,14 @@ def autocast(precision: Precision, device: torch.device) -> torch.autocast:
     "auto" is bfloat16 where the hardware computes in it, which makes training faster, and float32 elsewhere, where it
     would make it slower.
     """
-    half = _has_bfloat16(device) if precision == "auto" else precision == "bfloat16"
-    return torch.autocast(device.type, torch.bfloat16, enabled=half)
+    return torch.autocast(device.type, torch.bfloat16, enabled=resolved(precision, device) == "bfloat16")
+
+
+def resolved(precision: Precision, device: torch.device) -> Precision:
+    """What "auto" is on `device`; others are what they are."""
+    if precision == "auto":
+        return "bfloat16" if _has_bfloat16(device) else "float32"
+    return precision
 
 
 def _has_bfloat16(device: torch.device) -> bool:

@@ -64,18 +64,22 @@ def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None
     )
 
 
+class RunLockedError(FileExistsError):
+    """Another process is training in the run folder."""
+
+
 def lock_run(folder: Path) -> FileLock:
     """Keep other processes out of a run folder, until the lock is released or this process ends.
 
     Raises:
-        FileExistsError: If another process has it.
+        RunLockedError: If another process has it.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder.parent / f".{folder.name}.lock")
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        raise FileExistsError(
+        raise RunLockedError(
             f"another process is training in {folder}: wait for its end, or choose another folder with --run"
         ) from None
     return lock

@@ -8,9 +8,12 @@ import pytest
 from rich.console import Console
 
 import paper
+import paper_experiment
+from gnn_policy import DecentralizedPolicy, load, save
+from gnn_policy.checkpoint import fingerprint
 from gnn_policy.config import RECIPES
 from gnn_policy.progress import TrainingProgress
-from gnn_policy.training import Training
+from gnn_policy.training import Training, lock_run
 from paper_experiment import Experiment, Model, Options, Scene
 from paper_figures import draw, success_rates, tables
 from small_training import CONFIG
@@ -99,6 +102,57 @@ def test_only_what_is_missing_is_trained_and_a_training_that_was_stopped_goes_on
     assert {each.name for each in tmp_path.iterdir() if each.is_dir()} == {"n4-k3", "n12-k3", "results"}
 
 
+def test_models_are_tested_once_and_results_of_other_settings_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(RECIPES, "full", replace(CONFIG, epochs=1, dagger_every=0))
+    options = {"taps": (3,), "train_on": (4,)}
+    whole, console = experiment(tmp_path, **options), Console(quiet=True)
+    paper.train(whole, console)
+    monkeypatch.setattr(paper_experiment, "TEAMS", (4, 6))
+    whole = experiment(tmp_path, **options)
+    paper.test(whole, console)
+    files = {path: path.read_text() for path in sorted((tmp_path / "results").glob("*/*.json"))}
+    assert [f"{path.parent.name}/{path.stem}" for path in files] == [
+        f"20x20-cells-n{N}/{player}" for N in (4, 6) for player in ("baselines", "n4-k3")
+    ]
+    found = json.loads(files[whole.result(Scene("cells", 6), "n4-k3")])
+    assert [row["name"] for row in found["rows"]] == found["settings"]["rows"] == ["argmax", "stuck,1"]
+    assert found["cases"] + found["unsolved_by_expert"] == CONFIG.test_maps
+    paper.test(whole, console)
+    assert all(path.read_text() == text for path, text in files.items())
+    for changed, word in (({"cases_per_map": 2}, "cases_per_map"), ({"rows": ("argmax",)}, "rows")):
+        with pytest.raises(FileExistsError, match=rf"other settings \({word}\)"):
+            paper.test(experiment(tmp_path, **options, **changed), console)
+    weights = whole.run_of(Model(4, 3)) / "best.safetensors"
+    save(DecentralizedPolicy(Model(4, 3).config.policy), weights)
+    with pytest.raises(FileExistsError, match=r"other settings \(policy\)"):
+        paper.plan(whole, console)
+
+
+def test_policies_of_the_package_are_tested_in_place_of_trained_ones(tmp_path):
+    whole = experiment(tmp_path, packaged=True, kinds=("paper", "informed"))
+    files = [whole.policy_of(model) for model in whole.models]
+    assert [file and file.name for file in files] == [
+        *("n4.safetensors", "n12.safetensors", None, None, None, None),
+        "n12-informed.safetensors",
+    ]
+    assert not whole.untrained()
+
+
+def test_what_no_model_has_is_refused(tmp_path):
+    for wrong in ({"taps": (0,)}, {"taps": ()}, {"train_on": ()}):
+        with pytest.raises(ValueError, match="at least one"):
+            experiment(tmp_path, **wrong)
+
+
+def test_a_model_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(RECIPES, "full", replace(CONFIG, epochs=1))
+    whole = experiment(tmp_path, taps=(3,))
+    lock = lock_run(whole.run_of(Model(4, 3)))
+    paper.train(whole, Console(quiet=True))
+    lock.release()
+    assert [model.num_agents for model in whole.models if whole.is_trained(model)] == [12]
+
+
 def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
     whole = experiment(tmp_path)
     for N in (4, 6, 8, 10, 12):
@@ -125,3 +179,12 @@ def test_the_tables_of_the_docs_are_drawn_from_the_results_beside_them():
     drawn = "\n".join(tables(Experiment(Options(folder=folder)))) + "\n"
     assert (folder / "results.md").read_text() == drawn
     assert drawn.count("\n## ") >= 1
+
+
+def test_the_results_of_the_docs_are_those_of_the_package():
+    results = Path(__file__).parents[2] / "docs" / "paper" / "results"
+    played = {path.stem: json.loads(path.read_text())["settings"]["policy"] for path in results.glob("*/n*-k3*.json")}
+    packaged = {name: fingerprint(load(name.replace("-k3", ""))) for name in played if "connected" not in name}
+    assert len(packaged) == 6
+    for name, known in packaged.items():
+        assert played[name] == known, name
