@@ -56,7 +56,7 @@ def _figure2(experiment: Experiment, style: MapStyle) -> Figure:
     diagonal = [PAPER[N][TEAMS.index(N)] for N in known]
     panels[0].plot(known, diagonal, "kx", label="paper, K = 3")
     panels[0].legend(fontsize=7)
-    figure.suptitle(f"Figure 2, {style} maps: what communication adds")
+    figure.suptitle(f"Figure 2, maps of {style}: what communication adds")
     return figure
 
 
@@ -89,7 +89,7 @@ def _figure3(experiment: Experiment, style: MapStyle) -> Figure:
     for axes, (title, values, signed) in zip(panels, pictures, strict=True):
         heat_map(axes, title, values, list(PAPER), TEAMS, signed=signed)
         axes.set_ylabel("robots in training")
-    figure.suptitle(f"Figure 3, {style} maps: success rate, K = 3")
+    figure.suptitle(f"Figure 3, maps of {style}: success rate, K = 3")
     return figure
 
 
@@ -103,11 +103,11 @@ def heat_map(
     signed: bool = False,
 ) -> None:
     """A cell for each pair of training and test teams, white where there is no number; differences are signed."""
-    colours, low, high = ("RdYlGn", -0.3, 0.3) if signed else ("viridis", 0.3, 1.0)
+    colours, low, high = ("PuOr_r", -0.5, 0.5) if signed else ("viridis", 0.3, 1.0)
     axes.imshow(values, cmap=colours, vmin=low, vmax=high, aspect="auto")
     for i, j in np.argwhere(np.isfinite(values)):
         text = f"{values[i, j]:{'+' if signed else ''}.3f}".replace("0.", ".", 1)
-        dark = not signed and values[i, j] < 0.8
+        dark = abs(values[i, j]) > 0.3 if signed else values[i, j] < 0.8
         axes.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "black")
     axes.set(title=title, xlabel="robots in test")
     axes.set_xticks(range(len(columns)), list(map(str, columns)))
@@ -136,8 +136,8 @@ def tables(experiment: Experiment) -> Iterator[str]:
             players = _players(experiment, [row["name"] for row in tested[0]["rows"]])
             yield f"## {style.capitalize()}, {size} x {size}\n"
             cases = " or ".join(sorted({str(each["cases"]) for each in tested}))
-            expert = f"the expert's flowtime is {max(each['expert_over_bound'] for each in tested):.4f} of its bound"
-            yield f"{cases} cases for each size of the team; {expert} at most.\n"
+            over = max(each["expert_over_bound"] for each in tested)
+            yield f"{cases} cases for each size of the team; the expert's flowtime is at most {over:.4f} x its bound.\n"
             if size == 20:
                 for row in experiment.rows:
                     yield from _figure3_table(experiment, style, row)
@@ -169,7 +169,7 @@ def _figure2_table(experiment: Experiment, style: MapStyle, measure: str) -> Ite
     """A line for each kind of model, K and way to execute, a column for each size of the team."""
     sizes = sorted({model.num_agents for model in experiment.models})
     labels: dict[Kind, str] = {"paper": "", "connected": ", radius grown", "informed": ", informed"}
-    yield f"### Figure 2, teams of the size of training: {MEASURES[measure]}\n"
+    yield f"### Figure 2, on teams of the size of training. {MEASURES[measure]}\n"
     yield "| model | " + " | ".join(map(str, sizes)) + " |"
     yield "|---|" + "---|" * len(sizes)
     for kind, label in labels.items():

@@ -161,7 +161,7 @@ def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
     text = (tmp_path / "results.md").read_text()
     assert "## Cells, 20 x 20" in text
     assert "90 cases for each size of the team" in text
-    assert "flowtime is 1.0625 of its bound" in text
+    assert "flowtime is at most 1.0625 x its bound" in text
     assert "| 10 |  |  |  | 0.750 [0.650, 0.850] -0.148 |  |  |" in text
     assert "| n12-k3 argmax |  |  |  |  | 0.750 [0.650, 0.850] |" in text
     assert "| n12-k3 argmax |  |  |  |  | +75.0% [+65.0, +85.0] |" in text
