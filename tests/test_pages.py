@@ -126,7 +126,11 @@ def test_commands_in_the_text_name_scripts_and_options_that_exist(page: str) -> 
         script, *options = words[1:] if words[1] != "-m" else [words[2].replace(".", "/") + ".py", *words[3:]]
         if not (ROOT / script).is_file():
             script = f"{script.removesuffix('.py')}/command.py"
+        beside = [
+            (ROOT / script).with_name(f"{name}.py") for name in imported((ROOT / script).read_text(encoding="utf-8"))
+        ]
         sources = [ROOT / script, ROOT / "gnn_policy" / "config.py", ROOT / "gnn_policy" / "network.py"]
+        sources += [each for each in beside if each.is_file()]
         text = "".join(source.read_text(encoding="utf-8") for source in sources)
         for option in options:
             if option.startswith("--") and option != "--help":
