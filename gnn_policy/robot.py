@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,7 +99,7 @@ class Robot:
         """The neighbours that it hears in this step and the weights of their links."""
         return self._links
 
-    def begin(self, view: npt.NDArray[Any], links: Mapping[Hashable, float], cell: Sequence[int]) -> None:
+    def begin(self, view: npt.NDArray[Any], links: Mapping[Hashable, float], cell: Iterable[int]) -> None:
         """Start a step; what is left of another is dropped.
 
         Args:
