@@ -32,6 +32,7 @@ from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast, resolved
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.results import refuse_other_settings
 from gnn_policy.rollout import rollout
 from gnn_policy.training import RunLockedError, Training, split_cases
 from mapf_env.files import write_whole
@@ -45,7 +46,7 @@ STEPS = {20: 36, 50: 90}
 def plan(experiment: Experiment, console: Console) -> None:
     """Say what is to do and how long it takes on this machine."""
     torch.set_num_threads(experiment.options.threads)
-    untrained, untested = experiment.untrained(), list(_untested(experiment))
+    untrained, untested = experiment.untrained(), list(_untested(experiment, _policies(experiment)))
     hours = sum(map(_training_seconds, untrained)) / 3600
     threads = experiment.options.threads
     console.print(f"to train: {len(untrained)} models, about {hours:.1f} hours with {threads} thread(s)")
@@ -70,11 +71,11 @@ def train(experiment: Experiment, console: Console) -> None:
 def test(experiment: Experiment, console: Console) -> None:
     """Play every trained model on the test cases; results that exist are kept."""
     torch.set_num_threads(experiment.options.threads)
+    policies = _policies(experiment)
     todo: dict[Scene, list[Model | None]] = {}
-    for scene, model in _untested(experiment):
-        if model is not None and experiment.policy_of(model) is None:
-            continue
-        todo.setdefault(scene, []).append(model)
+    for scene, model in _untested(experiment, policies):
+        if model is None or model in policies:
+            todo.setdefault(scene, []).append(model)
     with Progress(console=console) as progress:
         task = progress.add_task("", total=sum(map(len, todo.values())))
         for scene, models in todo.items():
@@ -83,10 +84,12 @@ def test(experiment: Experiment, console: Console) -> None:
             for model in models:
                 progress.update(task, description=f"{scene.name}: {_name(model)}")
                 rows, failures = (
-                    (evaluation.baselines(exam), {}) if model is None else _play(experiment, scene, model, exam)
+                    (evaluation.baselines(exam), {})
+                    if model is None
+                    else _play(experiment, scene, model, policies[model], exam)
                 )
                 result = {
-                    "settings": _settings(experiment, scene, model),
+                    "settings": _settings(experiment, scene, model, policies),
                     **evaluation.as_json(rows, exam),
                     "failures": failures,
                 }
@@ -96,7 +99,15 @@ def test(experiment: Experiment, console: Console) -> None:
                 progress.advance(task)
 
 
-def _untested(experiment: Experiment) -> Iterator[tuple[Scene, Model | None]]:
+Policies = dict[Model, DecentralizedPolicy]
+"""Those of the experiment's models that are there."""
+
+
+def _policies(experiment: Experiment) -> Policies:
+    return {model: checkpoint.load(path) for model in experiment.models if (path := experiment.policy_of(model))}
+
+
+def _untested(experiment: Experiment, policies: Policies) -> Iterator[tuple[Scene, Model | None]]:
     """Where baselines (None) and models are still to be played.
 
     Raises:
@@ -106,18 +117,11 @@ def _untested(experiment: Experiment) -> Iterator[tuple[Scene, Model | None]]:
         path = experiment.result(scene, _name(model))
         if not path.exists():
             yield scene, model
-            continue
-        if model is not None and experiment.policy_of(model) is None:
-            continue  # its results came without it
-        known, settings = json.loads(path.read_text()), _settings(experiment, scene, model)
-        differ = [name for name in settings if known["settings"].get(name) != settings[name]]
-        if differ:
-            raise FileExistsError(
-                f"{path} has results of other settings ({', '.join(differ)}): give another --folder, or delete it"
-            )
+        elif model is None or model in policies:  # results that came without their model are taken as they are
+            refuse_other_settings(path, _settings(experiment, scene, model, policies), "--folder")
 
 
-def _settings(experiment: Experiment, scene: Scene, model: Model | None) -> dict[str, object]:
+def _settings(experiment: Experiment, scene: Scene, model: Model | None, policies: Policies) -> dict[str, object]:
     """All that a result depends on but the scene; the baselines play no policy."""
     settings: dict[str, object] = {
         "cases_per_map": experiment.cases_per_map(scene),
@@ -127,19 +131,12 @@ def _settings(experiment: Experiment, scene: Scene, model: Model | None) -> dict
     if model is not None:
         settings["rows"] = [each.name for each in experiment.executions(model, model.trained_for(scene))]
         settings["precision"] = resolved(experiment.options.precision, torch.device("cpu"))
-        settings["policy"] = checkpoint.fingerprint(_load(experiment, model))
+        settings["policy"] = checkpoint.fingerprint(policies[model])
     return settings
 
 
 def _name(model: Model | None) -> str:
     return model.name if model else "baselines"
-
-
-def _load(experiment: Experiment, model: Model) -> DecentralizedPolicy:
-    path = experiment.policy_of(model)
-    if path is None:
-        raise FileNotFoundError(f"{model.name} is not trained")
-    return checkpoint.load(path)
 
 
 def _exam(experiment: Experiment, scene: Scene) -> evaluation.Exam:
@@ -155,10 +152,10 @@ def _exam(experiment: Experiment, scene: Scene) -> evaluation.Exam:
 
 
 def _play(
-    experiment: Experiment, scene: Scene, model: Model, exam: evaluation.Exam
+    experiment: Experiment, scene: Scene, model: Model, policy: DecentralizedPolicy, exam: evaluation.Exam
 ) -> tuple[list[evaluation.Score], dict[str, dict[Failure, int]]]:
     """A row for each way to execute the model, and how its teams failed."""
-    policy, rows, failures = _load(experiment, model), [], {}
+    rows, failures = [], {}
     for execution in experiment.executions(model, model.trained_for(scene)):
         with autocast(experiment.options.precision, torch.device("cpu")):
             played = rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(execution))

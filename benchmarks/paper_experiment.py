@@ -161,9 +161,8 @@ class Experiment:
 
     def executions(self, model: Model, own_size: bool) -> list[Execution]:
         """How a model is executed, on teams of the size it was trained on or of others."""
-        shield = ",pibt" if model.kind == "informed" else ""
         names = (*self.options.rows, *(self.options.own_size_rows if own_size else ()))
-        return [Execution.parse(name + shield) for name in names]
+        return [Execution.parse(name, model.config.shield) for name in names]
 
     def run_of(self, model: Model) -> Path:
         """The run folder of a model."""

@@ -61,7 +61,7 @@ def examine(
         raise ValueError(f"failures must not be negative, got {failures}")
     sizes = tuple(num_agents) or (config.num_agents,)
     settings = _settings(policy, config, sizes, variants, split)
-    _refuse_to_overwrite(folder / "results.json", settings)
+    refuse_other_settings(folder / "results.json", settings, "--out")
     cases = {N: split_cases(config, split, N) for N in sizes}
     tables: dict[str, object] = {}
     shown: list[Rollouts] = []
@@ -120,7 +120,17 @@ def _settings(
     }
 
 
-def _refuse_to_overwrite(path: Path, settings: dict[str, Any]) -> None:
+def refuse_other_settings(path: Path, settings: dict[str, Any], option: str) -> None:
+    """Accept a file of results only if it is not there, or has these settings.
+
+    Args:
+        path: The file.
+        settings: All that its numbers depend on.
+        option: That of the command which names the folder.
+
+    Raises:
+        FileExistsError: If it has results of other settings.
+    """
     if not path.exists():
         return
     try:
@@ -130,7 +140,7 @@ def _refuse_to_overwrite(path: Path, settings: dict[str, Any]) -> None:
         differ = ["unknown"]
     if differ:
         raise FileExistsError(
-            f"{path} has results of other settings ({', '.join(differ)}): choose another folder with --out, "
+            f"{path} has results of other settings ({', '.join(differ)}): choose another folder with {option}, "
             "or delete the file"
         )
 
