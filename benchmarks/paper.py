@@ -28,11 +28,11 @@ from rich.progress import Progress
 from gnn_policy import checkpoint, evaluation
 from gnn_policy.command_line import mistakes_in_one_line
 from gnn_policy.config import RECIPES
+from gnn_policy.examination import refuse_other_settings
 from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast, resolved
 from gnn_policy.progress import TrainingProgress
-from gnn_policy.results import refuse_other_settings
 from gnn_policy.rollout import rollout
 from gnn_policy.training import RunLockedError, Training, split_cases
 from mapf_env.files import write_whole

@@ -14,8 +14,8 @@ from rich.console import Console
 
 from gnn_policy import checkpoint
 from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
+from gnn_policy.examination import examine
 from gnn_policy.execution import Execution
-from gnn_policy.results import examine
 from mapf_env.generation import MapStyle
 
 

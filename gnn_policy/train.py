@@ -14,9 +14,9 @@ from rich.console import Console
 from gnn_policy import checkpoint
 from gnn_policy.command_line import mistakes_in_one_line
 from gnn_policy.config import RECIPES, Recipe, TrainConfig
+from gnn_policy.examination import examine
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.ranks import Ranks, join_ranks
-from gnn_policy.results import examine
 from gnn_policy.training import Training
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, results
+from gnn_policy import DecentralizedPolicy, PolicyConfig, examination
 from gnn_policy.checkpoint import fingerprint
 from gnn_policy.config import TrainConfig
 from gnn_policy.rollout import Rollouts
@@ -27,9 +27,9 @@ def test_the_animation_shows_the_solved_case_of_median_length():
             [instance] * count, paths, np.array(success), zeros, np.array(makespans), np.array(success), np.zeros(count)
         )
 
-    assert results._worth_watching(played([True, True, False, True], [9, 4, 5, 6])) == 3
-    assert results._worth_watching(played([False, True, False], [1, 7, 9])) == 1
-    assert results._worth_watching(played([False, False], [5, 5])) == 0
+    assert examination._worth_watching(played([True, True, False, True], [9, 4, 5, 6])) == 3
+    assert examination._worth_watching(played([False, True, False], [1, 7, 9])) == 1
+    assert examination._worth_watching(played([False, False], [5, 5])) == 0
 
 
 def test_the_numbers_are_written_last(tmp_path, monkeypatch):
@@ -44,11 +44,11 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
         raise RuntimeError("crash")
 
     with monkeypatch.context() as patch:
-        patch.setattr(results, "animate", crash)
+        patch.setattr(examination, "animate", crash)
         with pytest.raises(RuntimeError, match="crash"):
-            results.examine(policy, config, tmp_path, console, threads=1)
+            examination.examine(policy, config, tmp_path, console, threads=1)
     assert list(tmp_path.iterdir()) == [], "a run with results.json counts as finished"
-    results.examine(policy, config, tmp_path, console, threads=1)
+    examination.examine(policy, config, tmp_path, console, threads=1)
     numbers = json.loads((tmp_path / "results.json").read_text())
     assert numbers["num_agents"]["2"]["cases"] == 4
     assert [row["name"] for row in numbers["num_agents"]["2"]["rows"]][:4] == [
@@ -81,6 +81,6 @@ def test_the_rows_are_played_under_the_shield_of_training(tmp_path):
     config = TrainConfig(
         policy=policy.config, num_agents=2, height=5, width=5, density=0.0, test_maps=1, cases_per_map=1, shield="pibt"
     )
-    results.examine(policy, config, tmp_path, Console(file=io.StringIO(), width=80), threads=1)
+    examination.examine(policy, config, tmp_path, Console(file=io.StringIO(), width=80), threads=1)
     rows = json.loads((tmp_path / "results.json").read_text())["num_agents"]["2"]["rows"]
     assert [row["name"] for row in rows][:4] == ["argmax,pibt", "stuck,1,pibt", "sampled,1,pibt", "random"]
