@@ -1,12 +1,13 @@
 """The pupil: a CNN-GNN policy that imitates an expert, its training loop and its evaluation."""
 
-try:
-    import torchrl  # noqa: F401
-except ImportError as missing:
+from importlib.util import find_spec
+
+# Looked for, not imported: to play a policy takes no TorchRL, whose import takes as long as all else.
+if missing := [name for name in ("torch", "torchrl") if find_spec(name) is None]:
     raise ImportError(
-        f'gnn_policy needs the extra "train" ({missing}): '
+        f'gnn_policy needs the extra "train" (there is no {missing[0]}): '
         'pip install "mapf-env[train]", or in a checkout pip install ".[train]"'
-    ) from None
+    )
 
 from gnn_policy.checkpoint import load, save
 from gnn_policy.execution import Execution

@@ -142,18 +142,18 @@ def compare(
     return [*rows, *baselines(exam, seed=seed, progress=progress)], played
 
 
+BASELINES = ("random", "greedy*", "greedy,stuck*", "PIBT*", "expert*")
+"""The names of those that learn nothing; with a star they know the whole map."""
+
+
 def baselines(exam: Exam, *, seed: int = 0, progress: Callable[[str], None] = lambda phase: None) -> list[Score]:
-    """The rows of those that learn nothing: random, greedy, greedy with random moves if stuck, PIBT, the expert."""
+    """The rows of `BASELINES`: two greedy ones, the second of which moves at random where it is stuck."""
     cases, rows = exam.instances, []
-    actors = {
-        "random": RandomActor(),
-        "greedy*": GreedyActor(cases),
-        "greedy,stuck*": GreedyActor(cases, random_when_stuck=True),
-    }
-    for name, actor in actors.items():
+    actors = (RandomActor(), GreedyActor(cases), GreedyActor(cases, random_when_stuck=True))
+    for name, actor in zip(BASELINES, actors, strict=False):
         progress(name)
         rows.append(score(name, exam, rollout(actor, cases, seed=seed, max_steps=exam.max_steps)))
-    progress("PIBT")
+    progress("PIBT*")
     return [*rows, _pibt_score(exam, seed), _expert_score(exam)]
 
 

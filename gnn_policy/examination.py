@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gnn_policy import checkpoint, evaluation
 from gnn_policy.cases import Split
@@ -20,6 +21,15 @@ from gnn_policy.rollout import Rollouts
 from gnn_policy.training import split_cases
 from mapf_env import EnvConfig, Scene, animate, replay_scenes
 from mapf_env.files import write_whole
+
+_COLUMNS = (
+    TextColumn("{task.description}"),
+    BarColumn(),
+    MofNCompleteColumn(),
+    TimeElapsedColumn(),
+    TextColumn("left"),
+    TimeRemainingColumn(),
+)
 
 
 def examine(
@@ -66,18 +76,20 @@ def examine(
     tables: dict[str, object] = {}
     shown: list[Rollouts] = []
     scenes: list[Scene] = []
-    with console.status("") as status:
+    with Progress(*_COLUMNS, console=console, transient=True) as progress:
+        task = progress.add_task("", total=len(sizes) * (len(variants) + len(evaluation.BASELINES)))
         for N, instances in cases.items():
             title = f"{N} robots, {settings['maps']} {split} maps"
-            status.update(f"{title}: expert")
+            progress.update(task, description=f"{title}: expert")
             exam = evaluation.Exam.prepare(instances, w=config.w, timeout=config.timeout, threads=threads)
             rows, shown = evaluation.compare(
                 exam,
                 policy,
                 variants,
                 seed=config.seed,
-                progress=lambda phase, title=title: status.update(f"{title}: {phase}"),
+                progress=lambda phase, title=title: progress.update(task, description=f"{title}: {phase}", advance=1),
             )
+            progress.advance(task)
             console.print(evaluation.table(title, rows, exam))
             kinds = {each.name: count_failures(played) for each, played in zip(variants, shown, strict=True)}
             tables[str(N)] = {**evaluation.as_json(rows, exam), "failures": kinds}
