@@ -9,8 +9,8 @@
 Figure 2 is success and flowtime increase of models tested on teams of the size they were trained on, for K = 1, 2 and
 3; figure 3 tests every model with K = 3 on every size, and the one of 12 robots that does not communicate. All models
 see equally many robot states. Beyond the paper there are models for teams whose radius grows until they are connected,
-and one that knows the map and is trained under the PIBT shield. Each finished model and each tested pair is a file;
-whatever is there is not done again.
+and one that knows the map and is trained under the PIBT shield on denser maps. Each finished model
+and each tested pair is a file; whatever is there is not done again.
 """
 
 from __future__ import annotations

@@ -101,7 +101,7 @@ class Model:
                 cost_to_go=informed,
             ),
             num_agents=N,
-            density=0.2 if informed else full.density,  # twice the passages in which one robot is in another's way
+            density=0.2 if informed else full.density,  # more corridors, where one robot is in another's way
             shield="pibt" if informed else "idle",
             **{name: getattr(full, name) * LARGEST // N for name in counts},
         )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from gnn_policy import checkpoint, evaluation
 from gnn_policy.cases import Split
@@ -21,15 +21,6 @@ from gnn_policy.rollout import Rollouts
 from gnn_policy.training import split_cases
 from mapf_env import EnvConfig, Scene, animate, replay_scenes
 from mapf_env.files import write_whole
-
-_COLUMNS = (
-    TextColumn("{task.description}"),
-    BarColumn(),
-    MofNCompleteColumn(),
-    TimeElapsedColumn(),
-    TextColumn("left"),
-    TimeRemainingColumn(),
-)
 
 
 def examine(
@@ -76,7 +67,7 @@ def examine(
     tables: dict[str, object] = {}
     shown: list[Rollouts] = []
     scenes: list[Scene] = []
-    with Progress(*_COLUMNS, console=console, transient=True) as progress:
+    with Progress(console=console, transient=True) as progress:
         task = progress.add_task("", total=len(sizes) * (len(variants) + len(evaluation.BASELINES)))
         for N, instances in cases.items():
             title = f"{N} robots, {settings['maps']} {split} maps"

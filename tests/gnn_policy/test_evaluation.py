@@ -146,7 +146,10 @@ def compared():
 
 def test_the_comparison_has_a_row_for_each_variant_and_competitor(compared):
     exam, policy, rows, played, phases = compared
-    assert [row.name for row in rows] == [*(each.name for each in VARIANTS), *evaluation.BASELINES]
+    competitors = ["random", "greedy*", "greedy,stuck*", "PIBT*", "expert*"]
+    assert [row.name for row in rows] == [each.name for each in VARIANTS] + competitors
+    assert list(evaluation.BASELINES) == competitors
+    assert phases == [row.name for row in rows[:-1]]  # the expert's row is there before
     assert phases == [row.name for row in rows[:-1]]  # the expert's row is there before
     settings = {"seed": 3, "max_steps": exam.max_steps}
     for variant, row, seen in zip(VARIANTS, rows, played, strict=False):
