@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 import experts
+from gnn_policy.command_line import mistakes_in_one_line
 from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.dagger import Teacher
 from gnn_policy.evaluation import Estimate, Exam
@@ -101,23 +102,22 @@ def main(options: Options) -> None:
     variants = LABELS if options.ablation == "labels" else DAGGER
     unknown = set(options.only) - set(variants)
     if unknown:
-        raise SystemExit(f"error: no variants {sorted(unknown)}: choose among {list(variants)}")
+        raise ValueError(f"no variants {sorted(unknown)}: choose among {list(variants)}")
+    if options.seeds < 1:
+        raise ValueError(f"--seeds must be at least 1, got {options.seeds}")
     chosen = [name for name in variants if not options.only or name in options.only]
     queue = [(name, seed) for seed in range(options.seeds) for name in chosen]
     for place, (name, seed) in enumerate(queue):
-        left = [each for each in queue[place:] if outcome(options.runs, *each) is None]
+        left = [each for each in queue[place:] if outcome(options, *each) is None]
         if (name, seed) in left:
             minutes = expected_minutes(options, variants) * len(left)
             console.print(f"{len(left)} runs to go, about {minutes:.0f} CPU minutes; now: {name}, seed {seed}")
-            settings = {"updates_per_epoch": options.updates, "seed": seed, **variants[name]}
-            if name not in DAGGER:
-                settings |= JUDGED_AT_THE_END
-            train(options, name, replace(BASE, **settings), console)
+            train(options, name, config_of(options, name, seed), console)
     found = {
         (name, seed): result
         for seed in range(options.seeds)
         for name in variants
-        if (result := outcome(options.runs, name, seed)) is not None
+        if (result := outcome(options, name, seed)) is not None
     }
     quality = label_quality(options.runs, console) if options.ablation == "labels" else {}
     table = markdown(found, quality)
@@ -162,9 +162,28 @@ def run_folder(runs: Path, name: str, seed: int) -> Path:
     return runs / re.sub(r"[^\w.]+", "-", f"{name} seed {seed}")
 
 
-def outcome(runs: Path, name: str, seed: int) -> dict[str, Any] | None:
-    file = run_folder(runs, name, seed) / "outcome.json"
-    return json.loads(file.read_text()) if file.exists() else None
+def config_of(options: Options, name: str, seed: int) -> TrainConfig:
+    """The settings of a run."""
+    settings = {"updates_per_epoch": options.updates, "seed": seed, **{**LABELS, **DAGGER}[name]}
+    if name not in DAGGER:
+        settings |= JUDGED_AT_THE_END
+    return replace(BASE, **settings)
+
+
+def outcome(options: Options, name: str, seed: int) -> dict[str, Any] | None:
+    """What came of a run, if it is finished.
+
+    Raises:
+        FileExistsError: If it is one of other settings.
+    """
+    folder = run_folder(options.runs, name, seed)
+    if not (folder / "outcome.json").exists():
+        return None
+    if differ := config_of(options, name, seed).differing(TrainConfig.load(folder / "config.json")):
+        raise FileExistsError(
+            f"{folder} holds a run of other settings ({', '.join(differ)}): choose another folder with --runs"
+        )
+    return json.loads((folder / "outcome.json").read_text())
 
 
 def expected_minutes(options: Options, variants: Variants) -> float:
@@ -173,7 +192,7 @@ def expected_minutes(options: Options, variants: Variants) -> float:
         result["all_seconds"] / 60
         for name in variants
         for seed in range(options.seeds)
-        if (result := outcome(options.runs, name, seed)) is not None
+        if (result := outcome(options, name, seed)) is not None
     ]
     return float(np.mean(taken)) if taken else CPU_MINUTES * options.updates / (BASE.updates_per_epoch or 1)
 
@@ -296,4 +315,5 @@ def draw(found: dict[tuple[str, int], dict[str, Any]], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    with mistakes_in_one_line():
+        main(tyro.cli(Options, description=__doc__))

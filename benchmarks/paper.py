@@ -45,10 +45,15 @@ STEPS = {20: 36, 50: 90}
 
 def plan(experiment: Experiment, console: Console) -> None:
     """Say what is to do and how long it takes on this machine."""
-    torch.set_num_threads(experiment.options.threads)
-    untrained, untested = experiment.untrained(), list(_untested(experiment, _policies(experiment)))
+    torch.set_num_threads(experiment.threads)
+    policies, untrained = _policies(experiment), experiment.untrained()
+    untested = [
+        (scene, model)
+        for scene, model in _untested(experiment, policies)
+        if model is None or model in policies or model in untrained
+    ]
     hours = sum(map(_training_seconds, untrained)) / 3600
-    threads = experiment.options.threads
+    threads = experiment.threads
     console.print(f"to train: {len(untrained)} models, about {hours:.1f} hours with {threads} thread(s)")
     hours = sum(_test_seconds(experiment, scene, model) for scene, model in untested if model) / 3600
     console.print(f"to test: {len(untested)} models and baselines, about {hours:.1f} hours for the models")
@@ -58,7 +63,7 @@ def train(experiment: Experiment, console: Console) -> None:
     """Train what is not trained and not being trained by another process; each model resumes by itself."""
     for model in experiment.untrained():
         console.rule(f"training {model.name}")
-        config = replace(model.config, threads=experiment.options.threads)
+        config = replace(model.config, threads=experiment.threads)
         with TrainingProgress(config.epochs, console) as progress:
             try:
                 training = Training(config, experiment.run_of(model), progress)
@@ -70,7 +75,7 @@ def train(experiment: Experiment, console: Console) -> None:
 
 def test(experiment: Experiment, console: Console) -> None:
     """Play every trained model on the test cases; results that exist are kept."""
-    torch.set_num_threads(experiment.options.threads)
+    torch.set_num_threads(experiment.threads)
     policies = _policies(experiment)
     todo: dict[Scene, list[Model | None]] = {}
     for scene, model in _untested(experiment, policies):
@@ -82,6 +87,10 @@ def test(experiment: Experiment, console: Console) -> None:
             progress.update(task, description=f"{scene.name}: expert")
             exam = _exam(experiment, scene)
             for model in models:
+                path = experiment.result(scene, _name(model))
+                if path.exists():  # another process was faster
+                    progress.advance(task)
+                    continue
                 progress.update(task, description=f"{scene.name}: {_name(model)}")
                 rows, failures = (
                     (evaluation.baselines(exam), {})
@@ -93,7 +102,6 @@ def test(experiment: Experiment, console: Console) -> None:
                     **evaluation.as_json(rows, exam),
                     "failures": failures,
                 }
-                path = experiment.result(scene, _name(model))
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(path, json.dumps(result, indent=2) + "\n")
                 progress.advance(task)
@@ -148,7 +156,7 @@ def _exam(experiment: Experiment, scene: Scene) -> evaluation.Exam:
         cases_per_map=experiment.cases_per_map(scene),
     )
     cases = split_cases(config, "test", scene.num_agents)
-    return evaluation.Exam.prepare(cases, w=W, timeout=config.timeout, threads=experiment.options.threads)
+    return evaluation.Exam.prepare(cases, w=W, timeout=config.timeout, threads=experiment.threads)
 
 
 def _play(

@@ -10,7 +10,9 @@ from typing import Any, Literal
 
 import tyro
 
+from gnn_policy import checkpoint
 from gnn_policy.checkpoint import WEIGHTS
+from gnn_policy.command_line import cpu_threads
 from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.precision import Precision
@@ -70,7 +72,7 @@ class Options:
     precision: Precision = "auto"
     """In which numbers the policies compute in the tests, as in gnn_policy.train."""
     threads: int = 1
-    """CPU threads of training, testing and the expert."""
+    """CPU threads of training, testing and the expert; 0 takes all that the process may use."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,9 @@ class Experiment:
     def __init__(self, options: Options) -> None:
         if min(options.taps, default=0) < 1 or not options.train_on:
             raise ValueError("give at least one of --taps, 1 or more, and one of --train-on")
+        if min(*options.train_on, options.cases_per_map, options.large_cases_per_map) < 1:
+            raise ValueError("--train-on, --cases-per-map and --large-cases-per-map must be positive")
+        self.threads = cpu_threads(options.threads)
         self.options = options
         self.rows = [Execution.parse(name).name for name in options.rows]
         self.own_size_rows = [Execution.parse(name).name for name in options.own_size_rows]
@@ -171,18 +176,27 @@ class Experiment:
 
     def policy_of(self, model: Model) -> Path | None:
         """What `gnn_policy.load` reads of a model that can be tested."""
-        if self.options.packaged:
-            file = WEIGHTS / f"{model.name.replace('-k3', '')}.safetensors"
-            return file if file.exists() else None
-        return self.run_of(model) if self.is_trained(model) else None
+        if not self.options.packaged:
+            return self.run_of(model) if self.is_trained(model) else None
+        file = WEIGHTS / f"{model.name.replace('-k3', '')}.safetensors"
+        if not file.exists():
+            return None
+        _refuse_other_settings(file, model, checkpoint.trained_with(file))
+        return file
 
     def untrained(self) -> list[Model]:
         """The models that are to be trained."""
         return [] if self.options.packaged else [each for each in self.models if not self.is_trained(each)]
 
     def is_trained(self, model: Model) -> bool:
-        """Whether its training has come to its end."""
-        metrics = self.run_of(model) / "metrics.csv"
+        """Whether its training has come to its end.
+
+        Raises:
+            FileExistsError: If the run folder holds a model of other settings.
+        """
+        metrics, config = (self.run_of(model) / name for name in ("metrics.csv", "config.json"))
+        if config.exists():
+            _refuse_other_settings(self.run_of(model), model, TrainConfig.load(config))
         return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.epochs
 
     def cases_per_map(self, scene: Scene) -> int:
@@ -200,3 +214,10 @@ class Experiment:
             return None
         rows = {each["name"]: each for each in json.loads(path.read_text())["rows"]}
         return rows.get(row)
+
+
+def _refuse_other_settings(place: Path, model: Model, found: TrainConfig) -> None:
+    if differ := model.config.differing(found):
+        raise FileExistsError(
+            f"{place} holds a model of other settings ({', '.join(differ)}): choose another --folder, or delete it"
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,9 @@ def _figure2(experiment: Experiment, style: MapStyle) -> Figure:
     figure, panels = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     measures = (("success_rate", "success rate"), ("flowtime_increase", "flowtime increase"))
     for axes, (measure, label) in zip(panels, measures, strict=True):
+        rows = [*experiment.rows, *experiment.own_size_rows]
         for taps in sorted(experiment.options.taps):
-            for row, line in zip([*experiment.rows, *experiment.own_size_rows], ("-", "--", ":"), strict=False):
+            for row, line in zip(rows, cycle(("-", "--", ":", "-.")), strict=False):
                 _line(experiment, axes, style, taps, row, measure, line)
         axes.set(xlabel="robots, in training and test", ylabel=label, xticks=list(experiment.options.train_on))
         axes.grid(alpha=0.3)
@@ -169,7 +171,7 @@ def _figure3_table(experiment: Experiment, style: MapStyle, row: str) -> Iterato
 def _figure2_table(experiment: Experiment, style: MapStyle, measure: str) -> Iterator[str]:
     """A line for each kind of model, K and way to execute, a column for each size of the team."""
     sizes = sorted({model.num_agents for model in experiment.models})
-    labels: dict[Kind, str] = {"paper": "", "connected": ", radius grown", "informed": ", informed"}
+    labels: dict[Kind, str] = {"paper": "", "connected": ", radius grown", "informed": ", informed*"}
     yield f"### Figure 2, on teams of the size of training. {MEASURES[measure]}\n"
     yield "| model | " + " | ".join(map(str, sizes)) + " |"
     yield "|---|" + "---|" * len(sizes)
@@ -184,15 +186,15 @@ def _figure2_table(experiment: Experiment, style: MapStyle, measure: str) -> Ite
 
 
 def _table(
-    experiment: Experiment, scenes: Sequence[Scene], players: Sequence[tuple[str, str]], measure: str
+    experiment: Experiment, scenes: Sequence[Scene], players: Sequence[tuple[str, str, str]], measure: str
 ) -> Iterator[str]:
     yield "| robots | " + " | ".join(str(scene.num_agents) for scene in scenes) + " |"
     yield "|---|" + "---|" * len(scenes)
-    for player, row in players:
+    for label, player, row in players:
         found = [experiment.row(scene, player, row) for scene in scenes]
         if any(found):
             cells = [_cell(measure, each) if each else "" for each in found]
-            yield f"| {row if player == 'baselines' else f'{player} {row}'} | " + " | ".join(cells) + " |"
+            yield f"| {label} | " + " | ".join(cells) + " |"
     if measure == "success_rate" and scenes[0].size == 20:
         for trained_on, values in PAPER.items():
             line = dict(zip(TEAMS, values, strict=True))
@@ -200,15 +202,15 @@ def _table(
             yield f"| paper, trained on {trained_on} | " + " | ".join(cells) + " |"
 
 
-def _players(experiment: Experiment, baselines: Sequence[str]) -> list[tuple[str, str]]:
-    """Who may have been tested on teams of any size, and how each was executed."""
+def _players(experiment: Experiment, baselines: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Who may have been tested on teams of any size: label, player and how it was executed; a star knows the map."""
     models = [
-        (model.name, execution.name)
+        (f"{model.name}{'*' if model.config.policy.cost_to_go else ''} {execution.name}", model.name, execution.name)
         for model in experiment.models
         if model.general
         for execution in experiment.executions(model, own_size=False)
     ]
-    return [*models, *(("baselines", row) for row in baselines)]
+    return [*models, *((row, "baselines", row) for row in baselines)]
 
 
 def _cell(measure: str, row: dict[str, Any]) -> str:

@@ -77,7 +77,7 @@ class TrainConfig:
     dagger_every: int = 4
     """Rounds from one aggregation to the next; 0 for plain imitation."""
     dagger_steps: int = 32_768
-    """Team steps played in each aggregation."""
+    """Team steps played in each aggregation, at least: as many times rollout_teams x rollout_length as that takes."""
     beta_decay: float = 0.0
     """In round r a team step follows the expert with probability beta_decay ** r (DAgger's beta), else the policy."""
     fresh_share: float = 0.5
@@ -166,6 +166,11 @@ class TrainConfig:
             "validation": (self.validation_maps, self.validation_cases_per_map),
             "test": (self.test_maps, self.cases_per_map),
         }[split]
+
+    def differing(self, other: TrainConfig) -> list[str]:
+        """The names of the settings that differ, but for where it runs: threads and device."""
+        own, others = asdict(self), asdict(other)
+        return [name for name in own if own[name] != others[name] and name not in ("threads", "device")]
 
     def save(self, path: Path) -> None:
         """Write the settings as JSON."""

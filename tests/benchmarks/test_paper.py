@@ -142,6 +142,39 @@ def test_what_no_model_has_is_refused(tmp_path):
     for wrong in ({"taps": (0,)}, {"taps": ()}, {"train_on": ()}):
         with pytest.raises(ValueError, match="at least one"):
             experiment(tmp_path, **wrong)
+    for wrong in ({"train_on": (4, 0)}, {"cases_per_map": 0}, {"large_cases_per_map": 0}):
+        with pytest.raises(ValueError, match="must be positive"):
+            experiment(tmp_path, **wrong)
+    assert experiment(tmp_path, threads=0).threads >= 1
+
+
+def test_a_model_of_other_settings_is_refused(tmp_path, monkeypatch):
+    whole = experiment(tmp_path)
+    finish(whole, Model(4, 3))
+    replace(Model(4, 3).config, density=0.3, threads=7).save(whole.run_of(Model(4, 3)) / "config.json")
+    for action in (whole.untrained, lambda: whole.policy_of(Model(4, 3))):
+        with pytest.raises(FileExistsError, match=r"n4-k3 holds a model of other settings \(density\)"):
+            action()
+    monkeypatch.setitem(RECIPES, "full", replace(RECIPES["full"], epochs=7))
+    with pytest.raises(FileExistsError, match=r"n12\.safetensors holds a model of other settings \(epochs\)"):
+        experiment(tmp_path, packaged=True).policy_of(Model(12, 3))
+
+
+def test_a_pair_that_another_process_tested_meanwhile_is_left_as_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper_experiment, "TEAMS", (4,))
+    whole = experiment(tmp_path, packaged=True, taps=(3,), train_on=(4,))
+    path = whole.result(Scene("cells", 4), "n4-k3")
+    baselines = whole.result(Scene("cells", 4), "baselines")
+
+    def tested_by_another(exam):
+        path.write_text("another's")
+        return []
+
+    path.parent.mkdir(parents=True)
+    monkeypatch.setattr(paper.evaluation, "baselines", tested_by_another)
+    paper.test(whole, Console(quiet=True))
+    assert baselines.exists()
+    assert path.read_text() == "another's"
 
 
 def test_a_model_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch):
@@ -179,6 +212,7 @@ def test_the_tables_of_the_docs_are_drawn_from_the_results_beside_them():
     drawn = "\n".join(tables(Experiment(Options(folder=folder)))) + "\n"
     assert (folder / "results.md").read_text() == drawn
     assert drawn.count("\n## ") >= 1
+    assert "\n| n12-k3-informed* argmax,pibt |" in drawn, "a star knows the map"
 
 
 def test_the_results_of_the_docs_are_those_of_the_package():
