@@ -47,15 +47,18 @@ class Perception:
         obstacles: rules.Bordered,
         positions: rules.Positions,
         goals: rules.Positions,
+        distances: npt.NDArray[np.uint16] | None = None,
     ) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32]]:
         """Views (B, N, C, F, F) and graphs (B, N, N) of teams that play the given cases (B,).
 
-        The maps (B, H, W) stand inside a border of fov_radius, in the dtype of the views.
+        The maps (B, H, W) stand inside a border of fov_radius, in the dtype of the views. Who plays cases for long may
+        keep their `distances` of `rules.distance_tables`, which a policy that knows the map needs.
         """
         radius = self._config.fov_radius
         fov = rules.observe(obstacles, positions, goals, radius)
         if self._config.cost_to_go:
-            distances = rules.distance_tables(obstacles, radius, goals)
+            if distances is None:
+                distances = rules.distance_tables(obstacles, radius, goals)
             extra = rules.observe_extra(obstacles, positions, radius, "cost_to_go", distances=distances)
             fov = np.concatenate([fov, extra[:, :, None]], axis=2)
         return fov, rules.communication_graph(positions, self._radii[cases], weights=self._weights)

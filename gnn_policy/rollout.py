@@ -84,13 +84,18 @@ class PolicyActor:
         self._device = next((each.device for each in policy.parameters()), torch.device("cpu"))
         self.border = config.fov_radius
         self.memory = STUCK_MEMORY if execution.sample == "stuck" else 0
+        self._rows: dict[int, int] = {}
 
     def act(self, teams: Teams) -> npt.NDArray[np.float32]:
         """Observe, communicate and value the moves."""
         count, device = len(teams.cases), self._device
         padded = np.arange(_padded_size(count)).clip(max=count - 1)
         fov, graph = self._perception.observe(
-            teams.cases[padded], teams.obstacles[padded], teams.positions[padded], teams.goals[padded]
+            teams.cases[padded],
+            teams.obstacles[padded],
+            teams.positions[padded],
+            teams.goals[padded],
+            self._tables(teams, padded) if self.config.cost_to_go else None,
         )
         with torch.inference_mode():
             logits = self.policy(torch.from_numpy(fov).to(device), torch.from_numpy(graph).to(device))[:count]
@@ -99,6 +104,13 @@ class PolicyActor:
             alarmed |= hears_of(alarmed, graph[:count])
         seeds = robot_seeds(teams.seeds, graph.shape[1])
         return self.execution.values(logits.float().cpu().numpy(), alarmed, seeds, teams.time)
+
+    def _tables(self, teams: Teams, chosen: Cases) -> npt.NDArray[np.uint16]:
+        """(B, N, size) distances to the goals of the chosen teams (B,), which stay as long as they are played."""
+        if not self._rows.keys() >= set(teams.cases.tolist()):
+            self._rows = {case: row for row, case in enumerate(teams.cases.tolist())}
+            self._distances = rules.distance_tables(teams.obstacles, self.border, teams.goals)
+        return self._distances[[self._rows[case] for case in teams.cases[chosen].tolist()]]
 
 
 def _padded_size(teams: int) -> int:

@@ -7,12 +7,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import experts
-from gnn_policy import DecentralizedPolicy, PolicyConfig, rollout
+from gnn_policy import DecentralizedPolicy, PolicyConfig, load, rollout
 from gnn_policy.baselines import RandomActor
 from gnn_policy.cases import make_cases
 from gnn_policy.execution import Execution
 from gnn_policy.rollout import PolicyActor, Teams
-from mapf_env import BatchedEnv, Instance, parallel_env
+from mapf_env import BatchedEnv, Instance, parallel_env, rules
 
 few = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -191,6 +191,19 @@ def test_the_size_of_batches_does_not_matter(cases, policy, sample):
     played = [rollout(policy, cases, sample=sample, max_steps=25, batch_size=size) for size in (1, 3, 5, 256)]
     for other in played[1:]:
         assert all(same(played[0], other, i, i) for i in range(len(cases)))
+
+
+def test_a_policy_that_knows_the_map_measures_the_ways_once_for_each_batch(monkeypatch):
+    maps = random_cases(maps=4, cases_per_map=1) + random_cases(seed=1, maps=3, cases_per_map=1)
+    policy = load("n12-informed")
+    measured = []
+    tables = rules.distance_tables
+    monkeypatch.setattr(rules, "distance_tables", lambda *given: (measured.append(len(given[0])), tables(*given))[1])
+    once = rollout(policy, maps, max_steps=25, batch_size=4)
+    assert measured == [4, 3]
+    assert once.makespan.max() > once.makespan.min(), "teams end at different times"
+    alone = rollout(policy, maps, max_steps=25, batch_size=1)
+    assert all(same(once, alone, i, i) for i in range(len(maps)))
 
 
 @few
