@@ -124,6 +124,15 @@ def test_cases_that_the_expert_does_not_solve_are_counted_and_left_out():
     assert Exam.prepare(cases, w=1.0, timeout=3.0, threads=1).unsolved == 0
 
 
+def test_which_cases_the_expert_solves_is_no_matter_of_time(monkeypatch):
+    asked = []
+    solve = experts.solve_many
+    monkeypatch.setattr(experts, "solve_many", lambda *cases, **how: (asked.append(how), solve(*cases, **how))[1])
+    Exam.prepare(corridor((0, 4)), w=1.0, timeout=3.0, threads=1)
+    assert asked[0]["time_limit"] == math.inf
+    assert 0 < asked[0]["node_limit"] < math.inf
+
+
 VARIANTS = [
     Execution(),
     Execution(sample=True, temperature=2.0),
