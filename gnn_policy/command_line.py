@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from gnn_policy.network import DecentralizedPolicy
 from mapf_env.arguments import MOST_THREADS
 
 
@@ -15,7 +16,7 @@ def mistakes_in_one_line() -> Iterator[None]:
     """Answer what bad options and files raise by one line on stderr and exit status 2, Ctrl-C by one and 130."""
     try:
         yield
-    except (ValueError, FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as mistake:
+    except (ValueError, OSError) as mistake:
         print(f"error: {mistake}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
@@ -30,3 +31,15 @@ def cpu_threads(asked: int) -> int:
     if asked > 0:
         return asked
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def on_device(policy: DecentralizedPolicy, device: str) -> DecentralizedPolicy:
+    """The policy on a device of PyTorch's, as "cuda".
+
+    Raises:
+        ValueError: If there is none of that name here.
+    """
+    try:
+        return policy.to(device)
+    except (RuntimeError, AssertionError) as refusal:
+        raise ValueError(f"the network cannot live on device {device!r}: {str(refusal).splitlines()[0]}") from None

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from gnn_policy import checkpoint
-from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
+from gnn_policy.command_line import cpu_threads, mistakes_in_one_line, on_device
 from gnn_policy.examination import examine
 from gnn_policy.execution import Execution
 from mapf_env.generation import MapStyle
@@ -69,6 +69,8 @@ class Command:
     evaluation/NAME in the working folder for a policy that comes with the package."""
     threads: int = 0
     """CPU threads; 0 takes all that the process may use."""
+    device: str = "cpu"
+    """Where the network computes, as in "cuda"."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -77,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         command = tyro.cli(
             Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.evaluate"
         )
-        policy = checkpoint.load(command.run)
+        policy = on_device(checkpoint.load(command.run), command.device)
         names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         prefix = "validation_" if command.split == "validation" else ""

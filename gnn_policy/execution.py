@@ -84,7 +84,7 @@ class Execution:
 
     @property
     def name(self) -> str:
-        """Words that tell the variants apart, as `parse` reads them: "argmax", "sampled,0.5,pibt"."""
+        """Words that tell variants apart, as `parse` reads them: "argmax", "sampled,0.5,pibt"; no word means "idle"."""
         words = [_WORD_OF_SAMPLE[self.sample]]
         if self.sample:
             words.append(f"{self.temperature:g}")

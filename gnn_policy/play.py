@@ -14,7 +14,7 @@ import tyro
 from rich.console import Console
 
 from gnn_policy import checkpoint
-from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
+from gnn_policy.command_line import cpu_threads, mistakes_in_one_line, on_device
 from gnn_policy.execution import Execution
 from gnn_policy.failures import failure
 from gnn_policy.rollout import rollout
@@ -49,6 +49,8 @@ class Command:
     """The page; the name of FILE with .html in the working folder if not given."""
     threads: int = 0
     """CPU threads; 0 takes all that the process may use."""
+    device: str = "cpu"
+    """Where the network computes, as in "cuda"."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -58,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.play"
         )
         torch.set_num_threads(cpu_threads(command.threads))
-        policy = checkpoint.load(command.run)
+        policy = on_device(checkpoint.load(command.run), command.device)
         execution = Execution.parse(command.row, checkpoint.trained_with(command.run).shield)
         instance = load_problem(
             command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed

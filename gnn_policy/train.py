@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from gnn_policy import checkpoint
-from gnn_policy.command_line import mistakes_in_one_line
+from gnn_policy.command_line import mistakes_in_one_line, on_device
 from gnn_policy.config import RECIPES, Recipe, TrainConfig
 from gnn_policy.examination import examine
 from gnn_policy.progress import TrainingProgress
@@ -70,7 +70,8 @@ def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) ->
         raise SystemExit(130) from None
     if ranks.rank > 0:
         return
-    examine(checkpoint.load(folder), config, folder, console, threads=training.threads)
+    policy = on_device(checkpoint.load(folder), config.device)
+    examine(policy, config, folder, console, threads=training.threads)
     console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
     console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)
 

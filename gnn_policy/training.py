@@ -21,7 +21,7 @@ import csv
 import pickle
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from gnn_policy import checkpoint, evaluation
 from gnn_policy.cases import Split, make_cases
-from gnn_policy.command_line import cpu_threads
+from gnn_policy.command_line import cpu_threads, on_device
 from gnn_policy.config import TrainConfig
 from gnn_policy.dagger import Aggregator, Teacher, teams_side_by_side
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
@@ -100,10 +100,7 @@ def open_run(folder: Path, config: TrainConfig) -> None:
         return
     if not (folder / "config.json").is_file():
         raise FileExistsError(f"{folder} exists and is no training run: choose another folder with --run")
-    known = TrainConfig.load(folder / "config.json")
-    if known != replace(config, threads=known.threads, device=known.device):
-        old, new = asdict(known), asdict(config)
-        differ = [name for name in new if old[name] != new[name] and name not in ("threads", "device")]
+    if differ := config.differing(TrainConfig.load(folder / "config.json")):
         raise FileExistsError(
             f"{folder} holds a run with other settings ({', '.join(differ)}): choose another folder with --run"
         )
@@ -139,10 +136,10 @@ class Training:
         self.config, self.folder, self.progress, self.ranks = config, folder, progress, ranks
         ranks.share("batch_size", config.batch_size)
         teams_side_by_side(config, ranks)
-        self.threads = config.threads or max(cpu_threads(0) // ranks.local_count, 1)
+        self.threads = cpu_threads(config.threads) if config.threads else max(cpu_threads(0) // ranks.local_count, 1)
         torch.set_num_threads(self.threads)
         torch.manual_seed(config.seed)
-        self.policy = _on_device(DecentralizedPolicy(config.policy), config.device)
+        self.policy = on_device(DecentralizedPolicy(config.policy), config.device)
         self.loss = ImitationLoss(ranks.average_gradients(self.policy))
         self.optimizer = torch.optim.Adam(
             self.policy.parameters(),
@@ -194,6 +191,7 @@ class Training:
         )
         batches = BatchMaker(self._instances, config.policy, augment=config.augment)
         aggregator = Aggregator(config, self.policy, self._teacher, self._instances, self.ranks)
+        torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
@@ -210,6 +208,7 @@ class Training:
         finally:
             torch.set_flush_denormal(False)
             aggregator.close()
+            torch.set_num_threads(self.threads)  # and give back more than they took
             if writer is not None:
                 writer.close()
                 self._lock.release()
@@ -232,14 +231,14 @@ class Training:
             raise ValueError("the expert solved none of the visited states: raise expert_nodes or make cases easier")
         between = self._clock()
         lr = float(self.scheduler.get_last_lr()[0])
-        loss, accuracy, updates = self._fit(number, demonstrations, batches)
+        loss, accuracy, updates, samples = self._fit(number, demonstrations, batches)
         self.scheduler.step()
         done = self._clock()
         previous = self.history[-1] if self.history else None
         row = Round(
             round=number,
             updates=updates + (previous.updates if previous else 0),
-            samples=updates * config.batch_size * config.num_agents + (previous.samples if previous else 0),
+            samples=samples + (previous.samples if previous else 0),
             seconds=0.0,
             collect_seconds=between - began,
             expert_seconds=self._teacher.seconds - taught,
@@ -260,9 +259,12 @@ class Training:
         every = self.config.dagger_every
         return number == 0 or (every > 0 and number % every == 0)
 
-    def _fit(self, number: int, demonstrations: Demonstrations, batches: BatchMaker) -> tuple[float, float, int]:
+    def _fit(self, number: int, demonstrations: Demonstrations, batches: BatchMaker) -> tuple[float, float, int, int]:
+        """Mean loss and accuracy, and how many updates and robot states they were."""
         config = self.config
         rng = np.random.default_rng([config.seed, number])
+        draws_of_network = np.random.SeedSequence([config.seed, number, self.ranks.rank]).generate_state(1)
+        torch.manual_seed(int(draws_of_network[0]))  # as dropout makes them
         draws = self._pass(demonstrations, rng) if config.updates_per_epoch is None else self._draw(demonstrations, rng)
         updates = len(draws)
         self.policy.train()
@@ -281,7 +283,7 @@ class Training:
         if self.ranks.count > 1:  # the last batch's statistics are each process's own
             self.policy.load_state_dict(self.ranks.from_first(self.policy.state_dict()))
         means = self.ranks.average(torch.tensor([losses.mean(), accuracies.mean()])).tolist()
-        return means[0], means[1], updates
+        return means[0], means[1], updates, sum(map(len, draws)) * config.num_agents
 
     def _pass(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[npt.NDArray[np.intp]]:
         """Every state once, in random order."""
@@ -367,10 +369,3 @@ class Training:
         return ValueError(
             f"{self.folder / 'state.pt'} is damaged: choose another folder with --run, or delete this one"
         )
-
-
-def _on_device(policy: DecentralizedPolicy, device: str) -> DecentralizedPolicy:
-    try:
-        return policy.to(device)
-    except (RuntimeError, AssertionError) as refusal:
-        raise ValueError(f"the network cannot live on device {device!r}: {str(refusal).splitlines()[0]}") from None

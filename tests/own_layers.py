@@ -12,3 +12,10 @@ class Deaf(torch.nn.Module):
 
     def forward(self, signal, graph):
         return self.mix(signal)
+
+
+class Forgetful(Deaf):
+    """One that drops half of what it has."""
+
+    def forward(self, signal, graph):
+        return torch.nn.functional.dropout(super().forward(signal, graph), training=self.training)

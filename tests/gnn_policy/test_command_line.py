@@ -7,7 +7,7 @@ import pytest
 from gnn_policy.command_line import cpu_threads, mistakes_in_one_line
 
 
-@pytest.mark.parametrize("mistake", [ValueError("no"), FileNotFoundError("no"), FileExistsError("no")])
+@pytest.mark.parametrize("mistake", [ValueError("no"), FileNotFoundError("no"), IsADirectoryError("no")])
 def test_mistakes_end_with_status_two(capsys, mistake):
     with pytest.raises(SystemExit) as end, mistakes_in_one_line():
         raise mistake

@@ -170,6 +170,7 @@ def test_results_of_another_policy_or_another_program_are_not_overwritten(file, 
         "--num-agents 0",
         "--seed -1",
         "--threads -1",
+        "--device abacus",
         "--failures -1",
     ],
 )

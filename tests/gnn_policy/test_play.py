@@ -119,6 +119,8 @@ def test_a_team_that_is_home_has_solved_it(home, capsys):
         ("own.map --agents 3 --seed -1", "seed"),
         ("own.map --agents 3 --max-steps 0", "max_steps must be at least 1"),
         ("own.map --agents 3 --threads -1", "threads"),
+        ("own.map --agents 3 --device abacus", "abacus"),
+        ("own.scen --map elsewhere", "elsewhere"),
         ("own.map --agents 3 --row best", "unknown word 'best'"),
         ("own.map --agents 3 --out none/page.html", "none is no folder"),
         ("own.map --agents 3 --out elsewhere", "elsewhere is a folder"),

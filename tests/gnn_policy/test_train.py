@@ -46,6 +46,7 @@ def test_an_option_for_every_setting_reaches_the_settings():
         ("--num-agents 500", "agents"),
         ("--policy.encoder released --policy.fov-radius 2", "fov_radius"),
         ("--device abacus", "abacus"),
+        ("--threads 5000", "threads"),
         ("--w 0.5", "w must be"),
     ],
 )

@@ -93,6 +93,7 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
         {},
         {"teacher": "pibt", "robot_order": "random", "beta_decay": 0.5},
         {"aggregation": "stuck", "teacher": "experts:lacam"},
+        {"policy": replace(CONFIG.policy, graph_layer="own_layers:Forgetful")},
     ],
 )
 def test_a_run_stopped_after_any_round_goes_on_to_the_same_end(run, tmp_path, settings):
@@ -250,6 +251,7 @@ def test_without_a_number_of_updates_a_round_is_one_pass(tmp_path, monkeypatch):
         passed = np.concatenate([chosen for size, chosen in seen if size == row.demonstrations])
         assert sorted(passed) == list(range(row.demonstrations))
     assert all(len(chosen) in (7, 8) for _, chosen in seen)
+    assert run.history[-1].samples == CONFIG.num_agents * sum(row.demonstrations for row in run.history)
 
 
 def test_a_share_of_each_batch_is_fresh_once_states_are_aggregated(tmp_path, monkeypatch):
