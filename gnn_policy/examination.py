@@ -19,7 +19,7 @@ from gnn_policy.failures import count_failures, worst
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.rollout import Rollouts
 from gnn_policy.training import split_cases
-from mapf_env import EnvConfig, Scene, animate, replay_scenes
+from mapf_env import Scene, animate, replay_scenes
 from mapf_env.files import write_whole
 
 
@@ -94,8 +94,8 @@ def examine(
     console.print(f"animation: {folder / 'animation.svg'}", highlight=False)
     if scenes:
         title = f"The worst cases of {variants[0].name} beside the expert's solutions"
-        radii = EnvConfig(fov_radius=policy.config.fov_radius, comm_radius=policy.config.comm_radius)
-        replay_scenes(scenes, folder / "failures.html", title=title, config=radii)
+        perceived = variants[0].perceived(policy.config)
+        replay_scenes(scenes, folder / "failures.html", title=title, config=perceived)
         console.print(f"worst cases: {folder / 'failures.html'}", highlight=False)
     write_whole(folder / "results.json", json.dumps({"settings": settings, "num_agents": tables}, indent=2) + "\n")
     console.print(f"numbers: {folder / 'results.json'}", highlight=False)

@@ -8,8 +8,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gnn_policy.network import CommRange, CommWeights
-from mapf_env import _native
+from gnn_policy.network import CommRange, CommWeights, PolicyConfig
+from mapf_env import EnvConfig, _native
 from mapf_env.rules import Positions
 
 Sample = Literal[False, True, "stuck"]
@@ -81,6 +81,14 @@ class Execution:
         values = logits.copy()
         values[draws] = logits[draws] / self.temperature + noise
         return values
+
+    def perceived(self, policy: PolicyConfig) -> EnvConfig:
+        """What the robots of a policy see and hear when it is executed so; all else is the default's."""
+        return EnvConfig(
+            fov_radius=policy.fov_radius,
+            comm_radius=policy.comm_radius,
+            comm_range=self.comm_range or policy.comm_range,
+        )
 
     @property
     def name(self) -> str:

@@ -18,7 +18,7 @@ from gnn_policy.command_line import cpu_threads, mistakes_in_one_line, on_device
 from gnn_policy.execution import Execution
 from gnn_policy.failures import failure
 from gnn_policy.rollout import rollout
-from mapf_env import EnvConfig, Instance, _native, replay
+from mapf_env import Instance, _native, replay
 from mapf_env.problem_file import load_problem
 
 PATIENCE = 4
@@ -82,8 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         kind = failure(instance, solution)
         told = f"{size}: {home} on goal after {len(solution.paths) - 1} steps"
         told += f", flowtime {solution.sum_of_costs}" if kind is None else f", failed: {kind}"
-        radii = EnvConfig(fov_radius=policy.config.fov_radius, comm_radius=policy.config.comm_radius)
-        replay(instance, solution, out, title=told, config=radii)
+        replay(instance, solution, out, title=told, config=execution.perceived(policy.config))
         console.print(f"{told} ({seconds:.1f} s)", highlight=False)
         console.print(f"replay: {out}", highlight=False, soft_wrap=True)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
 from typing import Any, NamedTuple
 
@@ -59,9 +59,9 @@ class BatchedEnv:
     Args:
         num_envs: The number of environments B.
         threads: Over how many threads the environments of a step are spread; it changes no result.
-        autoreset: As in Gymnasium: DISABLED; NEXT_STEP, the step after the end ignores the actions and begins the next
-            episode; or SAME_STEP, the step that ends returns the first observation of the next episode, and
-            `Step.final_observation` has the last ones of those that ended.
+        autoreset: As in Gymnasium: DISABLED; NEXT_STEP, the step after the end ignores the actions, which must be valid
+            all the same, and begins the next episode; or SAME_STEP, the step that ends returns the first observation of
+            the next episode, and `Step.final_observation` has the last ones of those that ended.
         cases: Instances to play, drawn anew at each reset by the seed, in place of random ones.
         fill: Take instances that are smaller than the environment too: the map is filled up with obstacles, and the
             robots that are not there have zeros everywhere, but for the action mask, which leaves them idle, so that a
@@ -79,7 +79,7 @@ class BatchedEnv:
         *,
         threads: int = 1,
         autoreset: AutoresetMode = AutoresetMode.DISABLED,
-        cases: Sequence[Instance] | None = None,
+        cases: Iterable[Instance] | None = None,
         fill: bool = False,
         **settings: Any,
     ) -> None:
@@ -121,6 +121,7 @@ class BatchedEnv:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
+        self._state = self._state.writeable()
         self._bind()
 
     @property
@@ -195,6 +196,8 @@ class BatchedEnv:
             TypeError: If a seed is no integer, an instance none, or the memory of another dtype.
         """
         chosen = np.arange(self.num_envs) if mask is None else np.flatnonzero(self._checked_mask(mask))
+        if out is not None:
+            self._write_observation(out, np.zeros(self.num_envs, np.bool_))  # nothing, if there is room for it
         self._begin(chosen, None if seed is None else self._checked_seeds(seed)[chosen], instances)
         self._state.replaced[chosen] = self._state.arrived[chosen] = False
         return self._observe(out)

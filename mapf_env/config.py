@@ -66,8 +66,8 @@ class EnvConfig:
     """The dtype of the views."""
 
     def __post_init__(self) -> None:
-        for name in ("num_agents", "fov_radius", "max_cycles"):
-            arguments.integer(getattr(self, name), name, 1, arguments.MOST_INT)
+        for name in ("num_agents", "height", "width", "fov_radius", "max_cycles"):
+            object.__setattr__(self, name, arguments.integer(getattr(self, name), name, 1, arguments.MOST_INT))
         check_map(self.height, self.width, self.density, self.fov_radius)
         if not arguments.number(self.comm_radius, "comm_radius") >= 0.0:
             raise ValueError(f"comm_radius must not be negative, got {self.comm_radius}")

@@ -155,8 +155,8 @@ def random_instance(
 
 def check_map(height: int, width: int, density: float, border: int = 1) -> None:
     """Raise ValueError or TypeError unless there are maps of that size and density."""
-    arguments.integer(height, "height", 1, arguments.MOST_INT)
-    arguments.integer(width, "width", 1, arguments.MOST_INT)
+    height = arguments.integer(height, "height", 1, arguments.MOST_INT)
+    width = arguments.integer(width, "width", 1, arguments.MOST_INT)
     if (height + 2 * border) * (width + 2 * border) > arguments.MOST_INT:
         raise ValueError(
             f"a map of height {height} and width {width} with a border of {border} has more than "

@@ -62,8 +62,8 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         arguments.flag(reuse_buffers, "reuse_buffers")
         if render_mode is not None:
             arguments.choice(render_mode, self.metadata["render_modes"], "render_mode")
+        self.config = config = EnvConfig(**settings)  # which has none of the options of a batch alone
         self._batch = BatchedEnv(1, **settings)
-        self.config = config = self._batch.config
         if preferences and config.shield != "pibt":
             raise ValueError('preferences over all five moves need shield="pibt"')
         self._observation, self._preferences, self._reuse = observation, preferences, reuse_buffers

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,9 +40,10 @@ class InstanceSource:
         TypeError: If the cases are no instances.
     """
 
-    def __init__(self, config: EnvConfig, cases: Sequence[Instance] | None, fill: bool) -> None:
-        self._config, self._cases, self._fill = config, cases, arguments.flag(fill, "fill")
-        if cases is not None and not len(self.stack(cases, "cases").grids):
+    def __init__(self, config: EnvConfig, cases: Iterable[Instance] | None, fill: bool) -> None:
+        self._config, self._fill = config, arguments.flag(fill, "fill")
+        self._cases = None if cases is None else list(arguments.each_of(cases, Instance, "cases"))
+        if self._cases is not None and not len(self.stack(self._cases, "cases").grids):
             raise ValueError("there are no cases to play: give some, or None for random instances")
 
     def draw(self, seeds: npt.NDArray[np.uint64]) -> Problems:

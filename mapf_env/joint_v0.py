@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from mapf_env import arguments
 from mapf_env.batched_env import BatchedEnv, Observation
+from mapf_env.config import EnvConfig
 from mapf_env.grid_v0 import fov_space, instance_asked_for
 
 
@@ -26,8 +27,8 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, **settings: Any) -> None:
+        config = EnvConfig(**settings)  # which has none of the options of a batch alone
         self._batch = BatchedEnv(1, **settings)
-        config = self._batch.config
         N, view = config.num_agents, fov_space(config)
         low, high = (np.broadcast_to(bound, (N, *view.shape)) for bound in (view.low, view.high))
         self.observation_space = spaces.Dict(

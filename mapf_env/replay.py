@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
-from mapf_env import arguments, svg
+from mapf_env import arguments, rules, svg
 from mapf_env.config import EnvConfig
 from mapf_env.files import PathLike, write_whole
 from mapf_env.instance import Instance
@@ -42,7 +42,7 @@ def replay(
         solution: The paths (T + 1, N, 2), which need not solve the instance.
         path: Where to write the page too, if anywhere.
         title: A line above the map.
-        config: The settings whose fov_radius and comm_radius are shown; the paper's if not given.
+        config: The settings whose fov_radius, comm_radius and comm_range are shown; the paper's if not given.
 
     Raises:
         ValueError: If the paths are of another number of agents or leave the map.
@@ -64,7 +64,7 @@ def replay_scenes(
         scenes: At least one.
         path: Where to write the page too, if anywhere.
         title: A line above all of them.
-        config: The settings whose fov_radius and comm_radius are shown; the paper's if not given.
+        config: The settings whose fov_radius, comm_radius and comm_range are shown; the paper's if not given.
 
     Raises:
         ValueError: If there is no scene, one has no solution, or its paths are of another number of agents or leave
@@ -78,9 +78,8 @@ def replay_scenes(
     config = EnvConfig() if config is None else arguments.instance_of(config, EnvConfig, "config")
     content = {
         "title": arguments.instance_of(title, str, "title"),
-        "scenes": [_plain(scene) for scene in shown],
+        "scenes": [_plain(scene, config) for scene in shown],
         "fov_radius": config.fov_radius,
-        "comm_radius": min(config.comm_radius, 1e9),
     }
     page = files("mapf_env").joinpath("replay.html").read_text(encoding="utf-8")
     script = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")  # no text can end the script
@@ -90,17 +89,21 @@ def replay_scenes(
     return page
 
 
-def _plain(scene: Scene) -> dict[str, object]:
+def _plain(scene: Scene, config: EnvConfig) -> dict[str, object]:
     arguments.instance_of(scene.title, str, "the title of a scene")
     if not arguments.instance_of(scene.solutions, Mapping, f"the solutions of the scene {scene.title!r}"):
         raise ValueError(f"the scene {scene.title!r} has no solution to show; give at least one")
     for name, solution in scene.solutions.items():
         arguments.instance_of(name, str, f"the name of a solution of the scene {scene.title!r}")
         require_drawable(scene.instance, solution)
+    radius = config.comm_radius
+    if config.comm_range == "connected":
+        radius = rules.connecting_radius(scene.instance.starts, radius)
     return {
         "title": scene.title,
         "rows": ["".join("@" if cell else "." for cell in row) for row in scene.instance.grid],
         "goals": scene.instance.goals.tolist(),
+        "comm_radius": min(radius, 1e9),
         "colours": svg.colours(scene.instance.num_agents),
         "panels": [{"name": name, "paths": each.paths.tolist()} for name, each in scene.solutions.items()],
     }

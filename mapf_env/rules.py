@@ -2,7 +2,7 @@
 
 B is the number of environments, N of robots in each, F = 2 * fov_radius + 3 the side of a view. Maps are passed as
 `bordered(grids, fov_radius)` makes them, so that a view never leaves the array. Every function checks shapes and raises
-ValueError, or TypeError for a wrong dtype.
+ValueError, or TypeError where cells or actions are no integers.
 """
 
 from __future__ import annotations
@@ -21,6 +21,10 @@ Bordered = npt.NDArray[Any]
 _ACTION = np.dtype(np.int64)
 
 
+def _cells(values: npt.ArrayLike, name: str = "positions") -> Positions:
+    return arguments.cells(values, name, "(B, N, 2)")
+
+
 def bordered(grids: npt.NDArray[np.bool_], fov_radius: int, dtype: npt.DTypeLike = np.float32) -> Bordered:
     """Grids (B, H, W) inside a border of `fov_radius` obstacles, as 0 and 1 of the dtype that views shall have."""
     if fov_radius < 1:
@@ -33,8 +37,8 @@ def bordered(grids: npt.NDArray[np.bool_], fov_radius: int, dtype: npt.DTypeLike
 
 def observe(
     obstacles: Bordered,
-    positions: Positions,
-    goals: Positions,
+    positions: npt.ArrayLike,
+    goals: npt.ArrayLike,
     fov_radius: int,
     out: npt.NDArray[Any] | None = None,
 ) -> npt.NDArray[Any]:
@@ -45,6 +49,7 @@ def observe(
     (cells outside the map count), the own goal (exactly one cell), all robots in view, itself included.
     Source: Li et al. 2020, r_FOV = 4 gives 3 x 11 x 11; the layout is that of the authors' released code.
     """
+    positions, goals = _cells(positions), _cells(goals, "goals")
     if out is None:
         side = 2 * fov_radius + 3
         out = np.empty((*positions.shape[:2], 3, side, side), obstacles.dtype)
@@ -52,19 +57,19 @@ def observe(
     return out
 
 
-def distance_tables(obstacles: Bordered, fov_radius: int, goals: Positions) -> npt.NDArray[np.uint16]:
+def distance_tables(obstacles: Bordered, fov_radius: int, goals: npt.ArrayLike) -> npt.NDArray[np.uint16]:
     """Steps from each cell of the bordered maps to each goal, (B, N, size); 65535 where there is no way."""
-    return _native.distance_tables(obstacles, fov_radius, goals)
+    return _native.distance_tables(obstacles, fov_radius, _cells(goals, "goals"))
 
 
 def observe_extra(
     obstacles: Bordered,
-    positions: Positions,
+    positions: npt.ArrayLike,
     fov_radius: int,
     channel: Channel,
     *,
-    goals: Positions | None = None,
-    previous: Positions | None = None,
+    goals: npt.ArrayLike | None = None,
+    previous: npt.ArrayLike | None = None,
     distances: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[Any]:
     """A channel beyond the paper, (B, N, F, F), inside the same ring of zeros.
@@ -78,10 +83,10 @@ def observe_extra(
     needed = {"cost_to_go": distances, "other_goals": goals, "previous_positions": previous}[channel]
     if needed is None:
         raise ValueError(f"the channel {channel} needs distances, goals or previous, whichever it shows")
-    side = 2 * fov_radius + 3
+    side, positions = 2 * fov_radius + 3, _cells(positions)
     out = np.empty((*positions.shape[:2], side, side), obstacles.dtype)
     tables = np.zeros((0, 0, 0), np.uint16) if distances is None else distances
-    cells = np.zeros((0, 0, 2), np.int32) if channel == "cost_to_go" else needed
+    cells = np.zeros((0, 0, 2), np.int32) if channel == "cost_to_go" else _cells(needed, channel)
     _native.observe_channel(obstacles, fov_radius, positions, cells, tables, fov_radius, CHANNELS.index(channel), out)
     return out
 
@@ -117,12 +122,12 @@ def communication_graph(
     return out[0] if single else out
 
 
-def connecting_radius(positions: npt.NDArray[np.int32], radius: float) -> float:
+def connecting_radius(positions: npt.ArrayLike, radius: float) -> float:
     """The least radius * 1.1^k, k = 0, 1, ..., at which robots at `positions` (N, 2) all reach each other over others.
 
     Source: the released code of Li et al. 2020, which grows the radius so at the beginning of each case and keeps it.
     """
-    return _native.connecting_radius(positions, radius)
+    return _native.connecting_radius(arguments.cells(positions, "positions", "(N, 2)"), radius)
 
 
 def lose_messages(
@@ -152,7 +157,7 @@ class Edges(NamedTuple):
     """(E, 2) rows and columns from the receiver to the sender."""
 
 
-def communication_edges(graph: npt.NDArray[np.float32], positions: Positions) -> Edges:
+def communication_edges(graph: npt.ArrayLike, positions: npt.ArrayLike) -> Edges:
     """The edges of dense graphs (B, N, N) between robots at `positions` (B, N, 2).
 
     Raises:
@@ -175,7 +180,7 @@ def communication_edges(graph: npt.NDArray[np.float32], positions: Positions) ->
 def shield(
     obstacles: Bordered,
     fov_radius: int,
-    positions: Positions,
+    positions: npt.ArrayLike,
     actions: npt.ArrayLike,
     seeds: npt.NDArray[np.uint64],
     times: npt.NDArray[np.int64],
@@ -187,13 +192,13 @@ def shield(
     applied to their fixed point: what is returned never collides, and a joint action without conflicts is unchanged.
     Source: Li et al. 2020, section 2 (collision shielding).
     """
-    return _native.shield(obstacles, fov_radius, positions, as_actions(actions), seeds, times)
+    return _native.shield(obstacles, fov_radius, _cells(positions), as_actions(actions), seeds, times)
 
 
 def pibt_shield(
     obstacles: Bordered,
     fov_radius: int,
-    positions: Positions,
+    positions: npt.ArrayLike,
     wanted: npt.ArrayLike,
     under_way: npt.NDArray[np.int32],
     seeds: npt.NDArray[np.uint64],
@@ -212,14 +217,14 @@ def pibt_shield(
         values, actions = as_values(array), np.zeros((0, 0), np.int64)
     else:
         values, actions = np.zeros((0, 0, 0), np.float32), as_actions(array)
-    return _native.pibt_shield(obstacles, fov_radius, positions, values, actions, under_way, seeds, times)
+    return _native.pibt_shield(obstacles, fov_radius, _cells(positions), values, actions, under_way, seeds, times)
 
 
 def draw_goals(
     obstacles: Bordered,
     fov_radius: int,
-    positions: Positions,
-    goals: Positions,
+    positions: npt.ArrayLike,
+    goals: npt.ArrayLike,
     arrived: npt.NDArray[np.bool_],
     arrivals: npt.NDArray[np.int32],
     seeds: npt.NDArray[np.uint64],
@@ -230,8 +235,8 @@ def draw_goals(
     stand; if there is none, it keeps its goal. The draw depends on the environment's seed, the robot and the number of
     its `arrivals` (B, N).
     """
-    drawn = np.array(goals, np.int32, order="C")
-    _native.draw_goals(obstacles, fov_radius, positions, drawn, arrivals, arrived, seeds)
+    drawn = _cells(goals, "goals")
+    _native.draw_goals(obstacles, fov_radius, _cells(positions), drawn, arrivals, arrived, seeds)
     return drawn
 
 
@@ -251,11 +256,11 @@ def as_actions(actions: npt.ArrayLike) -> npt.NDArray[np.int64]:
     return array if array.dtype == _ACTION else array.astype(_ACTION)
 
 
-def move(positions: Positions, actions: npt.NDArray[np.int8]) -> Positions:
+def move(positions: npt.ArrayLike, actions: npt.ArrayLike) -> Positions:
     """Positions (B, N, 2) after the shielded actions (B, N)."""
-    return _native.move(positions, actions)
+    return _native.move(_cells(positions), as_actions(actions))
 
 
-def action_mask(obstacles: Bordered, fov_radius: int, positions: Positions) -> npt.NDArray[np.int8]:
+def action_mask(obstacles: Bordered, fov_radius: int, positions: npt.ArrayLike) -> npt.NDArray[np.int8]:
     """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle."""
-    return _native.action_mask(obstacles, fov_radius, positions)
+    return _native.action_mask(obstacles, fov_radius, _cells(positions))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import combinations
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -61,6 +61,9 @@ class Solution:
         array = arguments.cells(self.paths, "paths", "(T + 1, N, 2)", filled=True)
         array.flags.writeable = False
         object.__setattr__(self, "paths", array)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Solution, (self.paths,)
 
     @property
     def arrivals(self) -> npt.NDArray[np.int64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -96,3 +96,8 @@ class TeamState:
             on_goal=np.zeros((B, N), np.bool_),
             action_mask=np.zeros((B, N, 5), np.int8),
         )
+
+    def writeable(self) -> TeamState:
+        """The same, with copies of the arrays that cannot be written, as those are that were unpickled out of band."""
+        arrays = (getattr(self, each.name) for each in fields(self))
+        return TeamState(*(array if array.flags.writeable else array.copy() for array in arrays))

@@ -50,7 +50,18 @@ template <class Array>
 Layout layout_of(const Array& obstacles, int pad) {
     const int rows = static_cast<int>(obstacles.shape(1)), cols = static_cast<int>(obstacles.shape(2));
     require(pad >= 1 && rows > 2 * pad && cols > 2 * pad, "obstacles must have a border of pad >= 1 cells");
-    return {rows - 2 * pad, cols - 2 * pad, pad};
+    const Layout layout{rows - 2 * pad, cols - 2 * pad, pad};
+    // Who floods or moves relies on it: there is no way out of the map.
+    bool closed = true;
+    for (std::size_t b = 0; b < obstacles.shape(0); ++b) {
+        const auto* map = obstacles.data() + b * layout.size();
+        for (int row = -1; row <= layout.height; ++row)
+            closed &= map[layout.cell(row, -1)] != 0 && map[layout.cell(row, layout.width)] != 0;
+        for (int col = 0; col < layout.width; ++col)
+            closed &= map[layout.cell(-1, col)] != 0 && map[layout.cell(layout.height, col)] != 0;
+    }
+    require(closed, "obstacles must have a border of obstacles, as bordered() makes it");
+    return layout;
 }
 
 // Positions come from Python: a cell outside the map would be read outside the array.
@@ -184,13 +195,13 @@ Out<std::int8_t> shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positio
     return out;
 }
 
-Out<std::int32_t> move(In<std::int32_t, 3> positions, In<std::int8_t, 2> actions) {
+Out<std::int32_t> move(In<std::int32_t, 3> positions, In<std::int64_t, 2> actions) {
     require(positions.shape(0) == actions.shape(0) && positions.shape(1) == actions.shape(1) && positions.shape(2) == 2,
             "positions must have shape (B, N, 2) and actions (B, N)");
     auto [moved, out] = make_array<std::int32_t>({positions.shape(0), positions.shape(1), 2});
+    mapf::require_actions(actions.data(), actions.shape(0), actions.shape(1));
     for (std::size_t i = 0; i < actions.size(); ++i) {
         const auto action = actions.data()[i];
-        require(action >= 0 && action < mapf::num_actions, "actions must be 0..4 (up, left, down, right, idle)");
         moved[2 * i] = positions.data()[2 * i] + mapf::row_step[action];
         moved[2 * i + 1] = positions.data()[2 * i + 1] + mapf::col_step[action];
     }
@@ -396,7 +407,7 @@ NB_MODULE(_native, m) {
           "Set each weight of graph (B, N, N) to 0 with probability loss, drawn by seed and time.");
     m.def("connecting_radius", &connecting_radius, "positions"_a, "radius"_a,
           "The least radius * 1.1^k at which the robots (N, 2) are connected.");
-    m.def("move", &move, "positions"_a, "actions"_a, "(B, N, 2) int32 positions after the actions (B, N) int8.");
+    m.def("move", &move, "positions"_a, "actions"_a, "(B, N, 2) int32 positions after the actions (B, N) int64.");
     m.def("mix", &mix, "seeds"_a, "counters"_a, "(B,) uint64 hash of a seed and a counter.");
     mapf::define_stepper(m);
     define_for_dtype<float>(m);

@@ -114,7 +114,8 @@ void add_cells(MapBuilder& map, int obstacles, Random& random) {
             if (map.obstacles() < obstacles) map.try_block(cell);
 }
 
-void add_walls(MapBuilder& map, int obstacles, Random& random) {
+// Whether there was room: walls that happen to stand badly leave none for others.
+bool add_walls(MapBuilder& map, int obstacles, Random& random) {
     constexpr int segments = 2;
     const auto& layout = map.layout();
     const int pillar_rows = (layout.height + 1) / 2, pillar_cols = (layout.width + 1) / 2;
@@ -135,11 +136,22 @@ void add_walls(MapBuilder& map, int obstacles, Random& random) {
             col = next_col;
         }
         fruitless = map.obstacles() == before ? fruitless + 1 : 0;
-        if (fruitless > patience)
-            throw std::invalid_argument("walls fill at most about " + std::to_string(map.obstacles()) + " of the " +
-                                        std::to_string(layout.height * layout.width) + " cells here, not " +
-                                        std::to_string(obstacles) + ": lower the density or use the style \"cells\"");
+        if (fruitless > patience) return false;
     }
+    return true;
+}
+
+MapBuilder map_of_walls(int height, int width, int obstacles, Random& random) {
+    constexpr int attempts = 20;
+    int most = 0;
+    for (int attempt = 0; attempt < attempts; ++attempt) {
+        MapBuilder map(height, width);
+        if (add_walls(map, obstacles, random)) return map;
+        most = std::max(most, map.obstacles());
+    }
+    throw std::invalid_argument("walls fill at most about " + std::to_string(most) + " of the " +
+                                std::to_string(height * width) + " cells here, not " + std::to_string(obstacles) +
+                                ": lower the density or use the style \"cells\"");
 }
 
 // Maps drawn on a sheet of height * width cells, row-major; 1 is an obstacle.
@@ -232,12 +244,13 @@ void place_shelves(Sheet& sheet, const Parts& parts) {
 
 Grid random_map(Style style, const Parts& parts, int height, int width, int obstacles, Random& random) {
     if (style == Style::cells || style == Style::walls) {
-        MapBuilder map(height, width);
         if (obstacles >= height * width)
             throw std::invalid_argument(std::to_string(obstacles) + " obstacles leave no free cell on a " +
                                         std::to_string(height) + "x" + std::to_string(width) +
                                         " map: lower the density");
-        style == Style::cells ? add_cells(map, obstacles, random) : add_walls(map, obstacles, random);
+        if (style == Style::walls) return map_of_walls(height, width, obstacles, random).finish();
+        MapBuilder map(height, width);
+        add_cells(map, obstacles, random);
         return std::move(map).finish();
     }
     Sheet sheet(height, width, 0);

@@ -19,16 +19,21 @@ inline Random goal_random(std::uint64_t seed, int robot, int arrival) {
 // `taken` (layout.size()) has a 1 at each goal and is kept so. Returns whether the goal has changed.
 inline bool draw_goal(const Layout& layout, const std::int32_t* regions, const std::int32_t* position, Random random,
                       std::uint8_t* taken, std::int32_t* goal) {
-    constexpr int patience = 64;  // draws; where free cells are rarer than that, the next one is taken
+    constexpr int patience = 64;  // draws; where cells that fit are rarer than that, they are counted
     const int here = layout.cell(position[0], position[1]), area = layout.height * layout.width;
     const auto fits = [&](int place) {
         const int cell = layout.cell(place / layout.width, place % layout.width);
         return regions[cell] == regions[here] && !taken[cell] && cell != here;
     };
-    int place = random.below(area), draws = 1;
-    for (; draws < patience && !fits(place); ++draws) place = random.below(area);
-    for (int tries = 0; tries < area && !fits(place); ++tries) place = (place + 1) % area;
-    if (!fits(place)) return false;
+    int place = random.below(area);
+    for (int draws = 1; draws < patience && !fits(place); ++draws) place = random.below(area);
+    if (!fits(place)) {
+        int count = 0;
+        for (int each = 0; each < area; ++each) count += fits(each);
+        if (count == 0) return false;
+        int before = random.below(count);
+        for (place = 0; !fits(place) || before > 0; ++place) before -= fits(place);
+    }
     taken[layout.cell(goal[0], goal[1])] = 0;
     goal[0] = place / layout.width;
     goal[1] = place % layout.width;

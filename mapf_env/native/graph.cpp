@@ -72,7 +72,9 @@ double connecting_radius(const std::int32_t* positions, int num_agents, double r
         longest = std::max(longest, gap[closest]);
         newest = closest;
     }
-    while (num_agents > 1 && !(std::sqrt(longest) < radius)) radius *= 1.1;
+    const double infinity = std::numeric_limits<double>::infinity();
+    while (num_agents > 1 && !(std::sqrt(longest) < radius))
+        radius = std::max(radius * 1.1, std::nextafter(radius, infinity));  // the smallest numbers times 1.1 are themselves
     return radius;
 }
 

@@ -56,6 +56,7 @@ inline void observe_team(const Layout& layout, const T* obstacles, const std::in
     const int radius = fixed_radius ? fixed_radius : any_radius;
     const int side = 2 * radius + 3, plane = side * side;
     mark(layout, positions, num_agents, T{1}, marks);
+    T* const first = out;
     for (int i = 0; i < num_agents; ++i, out += num_planes * plane) {
         const int row = positions[2 * i], col = positions[2 * i + 1];
         const int corner = layout.cell(row - radius, col - radius);
@@ -64,7 +65,7 @@ inline void observe_team(const Layout& layout, const T* obstacles, const std::in
         out[plane + goal_index(goals[2 * i] - row, goals[2 * i + 1] - col, radius)] = T{1};
     }
     // In a pass of its own, which was measured to be faster.
-    out -= num_agents * num_planes * plane;
+    out = first;
     for (int i = 0; i < num_agents; ++i, out += num_planes * plane) {
         const int corner = layout.cell(positions[2 * i] - radius, positions[2 * i + 1] - radius);
         copy_window<fixed_radius>(marks + corner, layout.stride(), radius, out + 2 * plane);

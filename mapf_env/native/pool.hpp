@@ -17,14 +17,15 @@ namespace mapf {
 class Pool {
 public:
     explicit Pool(int threads) : parts_(threads), shares_(threads) {
-        for (int part = 1; part < threads; ++part) workers_.emplace_back([this, part] { work(part); });
+        try {
+            for (int part = 1; part < threads; ++part) workers_.emplace_back([this, part] { work(part); });
+        } catch (...) {  // the system has no more threads for us
+            end();
+            throw;
+        }
     }
 
-    ~Pool() {
-        job_ = nullptr;
-        open();
-        for (auto& worker : workers_) worker.join();
-    }
+    ~Pool() { end(); }
 
     Pool(const Pool&) = delete;
     Pool& operator=(const Pool&) = delete;
@@ -74,6 +75,12 @@ private:
                 if (ready()) return true;
         } while (std::chrono::steady_clock::now() < end);
         return false;
+    }
+
+    void end() {
+        job_ = nullptr;
+        open();
+        for (auto& worker : workers_) worker.join();
     }
 
     void open() {

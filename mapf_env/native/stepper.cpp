@@ -136,8 +136,7 @@ public:
         if (teams_.num_envs != 1 || agents.size() != N) fail("give one name for each agent of one team");
         require_masks(memory);
         write_action_mask(teams_, 0);
-        if (memory.masks.data() != teams_.action_mask)
-            std::copy_n(teams_.action_mask, N * num_actions, memory.masks.data());
+        std::copy_n(teams_.action_mask, N * num_actions, memory.masks.data());
         const std::array flags{teams_.replaced, teams_.on_goal, teams_.arrived};
         const std::size_t num_flags = options_.lifelong ? 3 : 2;
         PyObject* const ended[2] = {teams_.terminated[0] ? Py_True : Py_False, teams_.truncated[0] ? Py_True : Py_False};

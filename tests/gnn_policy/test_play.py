@@ -45,7 +45,7 @@ def test_a_scenario_is_played_as_it_stands(home, capsys):
     assert scene["goals"] == instance.goals.tolist()
     assert panel["paths"][0] == instance.starts.tolist()
     assert len(panel["paths"]) == 31
-    assert (data["fov_radius"], data["comm_radius"]) == (2, 3.0)
+    assert (data["fov_radius"], scene["comm_radius"]) == (2, 3.0)
     for before, after in zip(panel["paths"], panel["paths"][1:], strict=False):
         assert not oracles.faults(instance.grid, oracles.cells(before), oracles.cells(after))
     home_now = sum(cell == goal for cell, goal in zip(panel["paths"][-1], scene["goals"], strict=True))

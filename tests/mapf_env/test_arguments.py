@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -323,6 +324,9 @@ def test_a_scene_is_checked_when_it_is_shown() -> None:
 def test_numbers_of_numpy_are_numbers() -> None:
     config = EnvConfig(num_agents=np.int64(2), comm_radius=np.float32(3.0), density=0)  # pyright: ignore[reportArgumentType]
     assert (config.num_agents, config.comm_radius, config.density) == (2, 3.0, 0)
+    side = np.int16(200)  # whose square needs more bits
+    large = EnvConfig(num_agents=2, height=side, width=side, fov_radius=np.uint8(127))  # pyright: ignore[reportArgumentType]
+    assert BatchedEnv(1, **asdict(large)).reset(seed=0).fov.shape == (1, 2, 3, 257, 257)
     one, other = BatchedEnv(2, num_agents=2), BatchedEnv(2, num_agents=2)
     assert np.array_equal(one.reset(np.int8(3)).fov, other.reset(np.array([3, 4])).fov)  # pyright: ignore[reportArgumentType]
     assert BatchedEnv(np.int32(1), autoreset="NextStep").autoreset is AutoresetMode.NEXT_STEP  # pyright: ignore[reportArgumentType]

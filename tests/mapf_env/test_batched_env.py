@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -176,7 +178,14 @@ def test_ties_are_drawn_anew_in_each_step_and_episode() -> None:
     assert 5 < sum(first_wins(episode, 0) for episode in range(30)) < 25
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def out_of_band(env: Any) -> Any:
+    """A copy whose arrays came apart from it and may only be read, as between processes that share memory."""
+    parts: list[pickle.PickleBuffer] = []
+    whole = pickle.dumps(env, protocol=5, buffer_callback=parts.append)
+    return pickle.loads(whole, buffers=[bytes(part.raw()) for part in parts])
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), out_of_band])
 def test_copies_made_mid_episode_go_on_identically(duplicate: Any) -> None:
     for reset in (lambda env: env.reset(seed=5), lambda env: env.reset()):
         env = BatchedEnv(3, num_agents=8, height=6, width=6, max_cycles=20)
@@ -392,6 +401,11 @@ def test_a_refused_reset_changes_nothing() -> None:
             env.reset(seed=99, instances=instances)
     with pytest.raises(ValueError, match="mask must be bool"):
         env.reset(seed=99, mask=np.zeros(5, bool))
+    fov, graph = env.buffers()
+    with pytest.raises(ValueError, match="shape"):
+        env.reset(seed=99, out=Observation(fov[:, :2].copy(), graph))
+    with pytest.raises(TypeError, match="out must be an Observation"):
+        env.reset(seed=99, out=Observation(fov.astype(np.float64), graph))
     with pytest.raises(ValueError, match="non-negative seed"):
         env.reset(seed=-4)
     generator = np.random.default_rng(0)
@@ -407,3 +421,30 @@ def test_walls_that_cannot_reach_the_density_say_so_and_change_nothing() -> None
         env.reset(seed=0)
     with pytest.raises(RuntimeError, match="never reset"):
         env.step([[4, 4]])
+
+
+def test_cases_are_those_that_were_given_whatever_becomes_of_the_list() -> None:
+    cases = [random_instance(num_agents=2, height=5, width=5, seed=seed) for seed in range(3)]
+    settings: dict[str, Any] = {"num_agents": 2, "height": 5, "width": 5}
+    env, once = BatchedEnv(4, cases=cases, **settings), BatchedEnv(4, cases=(each for each in cases), **settings)
+    cases.clear()
+    assert_equal(env.reset(seed=1), once.reset(seed=1))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
+def test_threads_that_cannot_start_are_an_error_not_the_end_of_the_process() -> None:
+    program = """
+import resource
+import mapf_env
+env = mapf_env.BatchedEnv(1000, threads=1000, num_agents=2, height=4, width=4)
+with open("/proc/self/statm") as file:
+    used = int(file.read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 2**28, used + 2**28))
+try:
+    env.reset(seed=0)
+except (RuntimeError, MemoryError) as refusal:
+    print("refused", refusal)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("refused")

@@ -40,6 +40,11 @@ def test_walls_reach_usual_densities_exactly_and_lie_on_even_lines(
     assert not grid[1::2, 1::2].any()
 
 
+def test_walls_that_stand_badly_are_torn_down_and_built_anew() -> None:
+    for seed in range(40):  # a quarter of these maps have no room at the first attempt
+        assert random_map(density=0.4, style="walls", seed=seed).sum() == 160
+
+
 def test_walls_are_longer_than_cells() -> None:
     def touching(style: Style) -> float:
         grids = random_maps(range(200), style=style)

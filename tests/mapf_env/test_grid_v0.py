@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pettingzoo
 import pytest
+from gymnasium.vector import AutoresetMode
 from pettingzoo.test import api_test, max_cycles_test, parallel_api_test, parallel_seed_test, seed_test
 
 import mapf_env
@@ -205,3 +206,12 @@ def test_bad_calls_are_refused() -> None:
     assert env.step({"agent_0": np.int8(4), "agent_1": np.int64(4)})[1]
     with pytest.raises(TypeError, match="colour"):
         parallel_env(colour="red")
+
+
+@pytest.mark.parametrize("make", [parallel_env, mapf_env.env, mapf_env.joint_env])
+@pytest.mark.parametrize(
+    "option", [{"autoreset": AutoresetMode.SAME_STEP}, {"fill": True}, {"cases": []}, {"threads": 2}]
+)
+def test_what_only_a_batch_has_is_refused(make: Any, option: dict[str, Any]) -> None:
+    with pytest.raises(TypeError, match=next(iter(option))):
+        make(**option)

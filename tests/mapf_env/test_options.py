@@ -260,6 +260,10 @@ def test_the_connecting_radius_is_the_least_that_connects(
     assert rules.connecting_radius(np.array(crowd[1], np.int32), start) == expected
 
 
+def test_the_smallest_radius_grows_too() -> None:
+    assert 1 < rules.connecting_radius(np.array([[0, 0], [0, 1]], np.int32), 5e-324) < 1.1
+
+
 def test_messages_are_lost_as_often_as_asked_and_anew_in_each_step() -> None:
     graph = np.ones((1, 30, 30), np.float32)
     lost = [rules.lose_messages(graph, 0.3, np.zeros(1, np.uint64), np.array([time])) for time in range(20)]
@@ -328,6 +332,20 @@ def test_new_goals_are_uniform_where_most_cells_are_blocked() -> None:
     np.add.at(hits, tuple(drawn[:, 0].T), 1)
     assert hits[0, 0] == hits[grid].sum() == 0
     assert all(400 < hit < 600 for hit in hits[hits > 0])  # 500 expected, standard deviation 21
+
+
+def test_new_goals_are_uniform_where_cells_that_fit_are_very_rare() -> None:
+    draws, grid = 3000, np.ones((40, 40), bool)
+    free = [(0, 0), (0, 1), (1, 0), (1, 1), (39, 0)]
+    grid[tuple(np.transpose(free))] = False
+    maps = rules.bordered(np.broadcast_to(grid, (draws, 40, 40)), 1)
+    start = np.zeros((draws, 1, 2), np.int32)
+    arrived, counts = np.ones((draws, 1), np.bool_), np.ones((draws, 1), np.int32)
+    drawn = rules.draw_goals(maps, 1, start, start, arrived, counts, np.arange(draws).astype(np.uint64))
+    hits = np.zeros((40, 40), int)
+    np.add.at(hits, tuple(drawn[:, 0].T), 1)
+    assert hits.sum() == sum(hits[cell] for cell in free[1:4]) == draws, "no way leads to the last cell"
+    assert all(870 < hits[cell] < 1130 for cell in free[1:4])  # 1000 expected, standard deviation 26
 
 
 def test_edges_of_a_batch_are_those_of_its_teams() -> None:

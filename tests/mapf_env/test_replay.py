@@ -109,6 +109,15 @@ def test_the_page_plays_pauses_scrubs_and_tells_what_a_robot_knows(tmp_path: Pat
     assert told["paused"] == told["played"]
 
 
+def test_a_radius_that_grows_is_that_of_the_case() -> None:
+    apart = Instance(np.zeros((1, 9), bool), [[0, 0], [0, 8]], [[0, 0], [0, 7]])
+    near = Instance(np.zeros((1, 9), bool), [[0, 0], [0, 1]], [[0, 0], [0, 2]])
+    scenes = [Scene(name, each, {"": Solution(each.starts[None])}) for name, each in (("far", apart), ("near", near))]
+    page = replay_scenes(scenes, title="two", config=EnvConfig(comm_radius=2.0, comm_range="connected"))
+    radii = [float(found) for found in re.findall(r'"comm_radius":([0-9.]+)', page)]
+    assert radii == [pytest.approx(2.0 * 1.1**15), 2.0]
+
+
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
 def test_scenes_are_chosen_and_their_solutions_share_a_clock(tmp_path: Path) -> None:
     alone = Instance(np.zeros((1, 3), bool), [[0, 0]], [[0, 2]])

@@ -246,8 +246,16 @@ def test_wrong_arguments_are_refused() -> None:
         rules.observe(maps, team, team, 1, out=np.empty((1, 2, 3, 7, 7), np.float32))
     with pytest.raises(ValueError, match="out must have shape"):
         rules.communication_graph(team, 1.0, out=np.empty((1, 2, 3), np.float32))
-    with pytest.raises(ValueError, match=r"actions must be 0\.\.4"):
-        rules.move(team, np.array([[0, 5]], np.int8))
+    with pytest.raises(ValueError, match=r"action 258 of agent 1 in environment 0 is none of 0\.\.4"):
+        rules.move(team, [[0, 258]])
+    with pytest.raises(TypeError, match="actions must be integers"):
+        rules.move(team, [[0, 2.9]])
+    with pytest.raises(TypeError, match="positions must be integers, got dtype float64"):
+        rules.observe(maps, team + 0.5, team, 1)
+    with pytest.raises(ValueError, match="lies outside the map"):
+        rules.observe(maps, team.astype(np.int64) + 2**32, team, 1)
+    with pytest.raises(ValueError, match="must have a border of obstacles"):
+        rules.distance_tables(np.zeros((1, 4, 5), np.float32), 1, team)
     with pytest.raises(ValueError, match="positions must have shape"):
         rules.move(team, np.zeros((1, 3), np.int8))
     with pytest.raises(ValueError, match="fov_radius must be at least 1"):

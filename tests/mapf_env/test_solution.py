@@ -1,5 +1,6 @@
 """Laws of the answer: its cost and the audit of its faults."""
 
+import pickle
 import tracemalloc
 from itertools import pairwise
 
@@ -146,3 +147,10 @@ def test_conflicts_of_many_robots_need_little_memory() -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20e6
+
+
+def test_a_copy_by_pickle_cannot_be_written_either() -> None:
+    solution = Solution(np.zeros((2, 1, 2), np.int32))
+    copied = pickle.loads(pickle.dumps(solution))
+    assert (copied.paths == solution.paths).all()
+    assert not copied.paths.flags.writeable
