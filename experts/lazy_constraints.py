@@ -28,7 +28,8 @@ def lacam(
         instance: The problem.
         w: Where improvement stops, at least 1; by default the first plan is returned as it is.
         time_limit: Seconds of wall-clock time, `math.inf` for none. A plan found earlier is returned.
-        node_limit: Joint states to generate at most; this bounds the memory (about 8 bytes a robot and state).
+        node_limit: Joint states to generate at most, of about 8 bytes a robot. Where hardly any joint move is possible
+            many are tried for each state, which only time_limit bounds.
         seed: Draws the order of equally good moves and of constraints.
 
     Returns:

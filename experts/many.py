@@ -51,7 +51,8 @@ def solve_many(
         time_limit: Seconds for each instance, where a named solver takes a limit.
         node_limit: For each instance, where a named solver takes a limit.
         seed: Of named solvers.
-        progress: Called after each result with the number of instances done and of those solved.
+        progress: Called after each result with the number of instances done and of those solved; of ECBS, which shares
+            threads better the more it is given at once, after every 64 or so.
 
     Returns:
         One result for each instance, in their order; unsolved ones say why.
@@ -60,7 +61,8 @@ def solve_many(
         ValueError: If an argument is out of its range, or the solver has no `w` and one is given.
         TypeError: If an argument has the wrong type, an element of `instances` is no `Instance`, or a solver's answer
             no `Result`.
-        KeyboardInterrupt: At Ctrl-C, which stops ECBS at once; of other solvers those that are running finish first.
+        KeyboardInterrupt: At Ctrl-C, which stops ECBS, and any solver on one thread, at once. On more threads other
+            solvers begin no further instance, and those that are running go on in the background to their end.
     """
     problems = list(arguments.each_of(instances, Instance, "instances"))
     return list(
@@ -72,7 +74,7 @@ def solve_many(
             time_limit=time_limit,
             node_limit=node_limit,
             seed=seed,
-            backlog=max(1, len(problems)),
+            backlog=max(1, len(problems)) if progress is None else arguments.DEFAULT_BACKLOG,
             progress=progress,
         )
     )

@@ -49,11 +49,11 @@ class Result:
         """What a solver of your own answers: a solution, and the lower bound it has proved, if any.
 
         Raises:
-            ValueError: If a number is negative.
+            ValueError: If a number is negative, or the bound is above the cost.
             TypeError: If an argument has the wrong type.
         """
         arguments.instance_of(solution, Solution, "solution")
-        arguments.integer(lower_bound, "lower_bound", 0)
+        arguments.integer(lower_bound, "lower_bound", 0, solution.sum_of_costs)
         if not arguments.number(seconds, "seconds") >= 0:
             raise ValueError(f"seconds must not be negative, got {seconds}")
         return cls(Status.SOLVED, solution, solution.sum_of_costs, lower_bound, 0, 0, seconds)

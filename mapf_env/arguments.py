@@ -72,7 +72,10 @@ def number(value: object, name: str) -> float:
         return value
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:
+        raise ValueError(f"{name} must fit into 64 bits of floating point, got an integer beyond") from None
 
 
 def finite(value: object, name: str) -> float:

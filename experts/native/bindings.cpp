@@ -238,12 +238,13 @@ ResultParts prioritised(const GridArray& grids, const CellsArray& start_cells, c
 void improve(const mapf::Grid& grid, const std::vector<int>& starts, const std::vector<int>& goals,
              const mapf::JointPlan& plan, double w, std::uint64_t seed, mapf::Budget& budget, Outcome& outcome) {
     write_plan(grid.layout, starts, plan, outcome);
-    const auto target = w * static_cast<double>(outcome.lower_bound);
+    const auto target = mapf::cost_limit(w, outcome.lower_bound);
     mapf::DistanceTables distances;
-    if (static_cast<double>(outcome.cost) <= target || !distances.compute(grid, goals, budget)) return;
+    if (outcome.cost <= target || !distances.compute(grid, goals, budget)) return;
+    const mapf::Problem problem{grid, starts, goals, distances};
     mapf::NeighbourhoodSearch neighbourhoods;
-    neighbourhoods.begin({grid, starts, goals, distances}, seed, [&](std::size_t robot) { return plan.actions(robot); });
-    neighbourhoods.run(static_cast<std::int64_t>(target), std::numeric_limits<int>::max(), budget);
+    neighbourhoods.begin(problem, seed, [&](std::size_t robot) { return plan.actions(robot); });
+    neighbourhoods.run(target, std::numeric_limits<int>::max(), budget);
     if (neighbourhoods.cost() < outcome.cost) write_plan(grid.layout, starts, neighbourhoods, outcome);
 }
 

@@ -33,10 +33,10 @@ void DiagramBuilder::build(const Grid& grid, int start, int goal, const Distance
     diagram.length = -1;
     const int last_try = std::min(rules.latest, shortest + short_tries);
     int length = shortest;
-    while (length <= last_try && !try_length(start, length, diagram)) ++length;
+    while (length <= last_try && !try_length(start, length, diagram, budget)) ++length;
     if (length > last_try && last_try < rules.latest) {
         length = first_arrival(start, goal, length, rules.latest, last_rule, budget);
-        if (length != forever) try_length(start, length, diagram);
+        if (length != forever) try_length(start, length, diagram, budget);
     }
     for (const auto& closure : rules.closures) closed_from_[closure.cell] = forever;
 }
@@ -45,10 +45,11 @@ void DiagramBuilder::build(const Grid& grid, int start, int goal, const Distance
 int DiagramBuilder::first_arrival(int start, int goal, int earliest, int latest, int last_rule, Budget& budget) {
     here_.assign(1, start);
     since_.assign(closed_from_.size(), -1);
-    for (int time = 1; time <= latest && !here_.empty() && !budget.spent(); ++time) {
+    for (int time = 1; time <= latest && !here_.empty(); ++time) {
         bool arrives = false;
         after_.clear();
-        for (const int cell : here_)
+        for (const int cell : here_) {
+            if (budget.spent()) return forever;
             for (int action = 0; action < num_actions; ++action) {
                 const int next = cell + steps_[action];
                 if (distance_[next] == unreachable || time >= closed_from_[next]) continue;
@@ -58,6 +59,7 @@ int DiagramBuilder::first_arrival(int start, int goal, int earliest, int latest,
                 since_[next] = time;
                 after_.push_back(next);
             }
+        }
         if (arrives && time >= earliest) return time;
         // Once no rule changes any more, cells are only won; the robot has to leave its goal to come back, too.
         if (time > std::max(last_rule, earliest) + 2 && after_.size() == here_.size()) break;
@@ -66,7 +68,7 @@ int DiagramBuilder::first_arrival(int start, int goal, int earliest, int latest,
     return forever;
 }
 
-bool DiagramBuilder::try_length(int start, int length, DecisionDiagram& diagram) {
+bool DiagramBuilder::try_length(int start, int length, DecisionDiagram& diagram, Budget& budget) {
     diagram.nodes.clear();
     diagram.level.assign(1, 0);
     const DecisionDiagram::Node nowhere{start, {-1, -1, -1, -1, -1}};
@@ -75,6 +77,7 @@ bool DiagramBuilder::try_length(int start, int length, DecisionDiagram& diagram)
     for (int time = 1; time <= length; ++time) {
         const int begin = diagram.level[time - 1], end = diagram.level[time];
         for (int id = begin; id < end; ++id) {
+            if (budget.spent()) return false;
             const int cell = diagram.nodes[id].cell;
             for (int action = 0; action < num_actions; ++action) {
                 const int next = cell + steps_[action];

@@ -64,7 +64,7 @@ public:
     int best_path(const DecisionDiagram& diagram, const Traffic& traffic, std::vector<std::uint8_t>& actions);
 
 private:
-    bool try_length(int start, int length, DecisionDiagram& diagram);
+    bool try_length(int start, int length, DecisionDiagram& diagram, Budget& budget);
     int first_arrival(int start, int goal, int earliest, int latest, int last_rule, Budget& budget);
     void prune(DecisionDiagram& diagram);
 

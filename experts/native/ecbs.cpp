@@ -105,7 +105,7 @@ Status Ecbs::persist(int id, const EcbsOptions& options, Budget& budget) {
     for (int effort = first_effort;; effort += effort) {
         std::int64_t known = std::numeric_limits<std::int64_t>::max();
         if (!needs_optimum) {
-            const auto target = static_cast<std::int64_t>(std::floor(options.w * lower_bound_));
+            const auto target = cost_limit(options.w, lower_bound_);
             const bool enough = neighbourhoods.run(target, effort, budget);
             if (neighbourhoods.feasible()) known = neighbourhoods.cost();
             if (enough) return finish(Author::repair, known);

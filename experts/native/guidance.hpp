@@ -23,7 +23,7 @@ public:
         const auto& layout = grid.layout;
         const int rows = layout.row(goal) - layout.row(start), cols = layout.col(goal) - layout.col(start);
         estimate_ = std::abs(rows) + std::abs(cols);
-        now_.push_back({goal, static_cast<std::int16_t>(rows), static_cast<std::int16_t>(cols)});
+        now_.push_back({goal, rows, cols});
         search(start);
         distance_ = estimate_;
     }
@@ -49,7 +49,7 @@ private:
 
     struct Open {
         int cell;
-        std::int16_t rows, cols;  // below and right of the start
+        int rows, cols;  // below and right of the start
     };
 
     int residue(int cell) const { return residues_[byte_of(cell)] >> shift_of(cell) & 3; }
@@ -76,8 +76,7 @@ private:
                 const int next = here.cell + steps_[action];
                 if ((residues[byte_of(next)] >> shift_of(next) & 3) != unknown || blocked[next]) return;
                 (nearer ? now_ : later_)
-                    .push_back({next, static_cast<std::int16_t>(here.rows + row_step[action]),
-                                static_cast<std::int16_t>(here.cols + col_step[action])});
+                    .push_back({next, here.rows + row_step[action], here.cols + col_step[action]});
             };
             open(0, here.rows > 0);
             open(1, here.cols > 0);

@@ -145,7 +145,7 @@ void NeighbourhoodSearch::replan(Budget& budget) {
 
 bool NeighbourhoodSearch::plan(int robot, int tolerance, Budget& budget) {
     if (!search_.run(problem_->grid, reservations_, problem_->starts[robot], problem_->goals[robot],
-                     problem_->distances.to_goal_of(robot), tolerance, forever, budget))
+                     problem_->distances.to_goal_of(robot), tolerance, budget))
         return false;
     plan_[robot] = search_.actions();
     return true;

@@ -19,7 +19,10 @@ namespace mapf {
 // nothing; who knows a lower bound can tell what its plans are worth.
 class NeighbourhoodSearch {
 public:
-    // Begins with the given plan, which may have conflicts: path_of(robot) is a span of actions.
+    // Begins with the given plan, which may have conflicts: path_of(robot) is a span of actions. The problem must live
+    // as long as the search goes on.
+    template <class PathOf>
+    void begin(const Problem&&, std::uint64_t, const PathOf&) = delete;
     template <class PathOf>
     void begin(const Problem& problem, std::uint64_t seed, const PathOf& path_of) {
         reset(problem, seed);

@@ -2,9 +2,10 @@
 #pragma once
 
 #include <algorithm>
-#include <cmath>
 #include <limits>
 #include <vector>
+
+#include "experts/native/problem.hpp"
 
 namespace mapf {
 
@@ -82,8 +83,7 @@ private:
     }
 
     int focal_limit() const {
-        const double limit = std::floor(w_ * lower_bound());
-        return limit < std::numeric_limits<int>::max() ? static_cast<int>(limit) : std::numeric_limits<int>::max();
+        return static_cast<int>(std::min<std::int64_t>(cost_limit(w_, lower_bound()), std::numeric_limits<int>::max()));
     }
 
     double w_ = 1;

@@ -1,6 +1,7 @@
 // What every solver is given, and how a search can end.
 #pragma once
 
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <span>
@@ -14,6 +15,13 @@ namespace mapf {
 
 // In the order of Python's Status.
 enum class Status : std::uint8_t { solved, node_limit, time_limit, infeasible, step_limit };
+
+// The highest cost within the factor w, possibly infinite, of a bound.
+inline std::int64_t cost_limit(double w, std::int64_t bound) {
+    constexpr auto most = std::int64_t{1} << 62;
+    const double limit = std::floor(w * static_cast<double>(bound));
+    return limit < static_cast<double>(most) ? static_cast<std::int64_t>(limit) : most;  // most for inf * 0 too
+}
 
 // Steps to each robot's goal from every cell.
 class DistanceTables {

@@ -53,7 +53,7 @@ void ProvingSearch::open_root() {
 
 ProvingSearch::Outcome ProvingSearch::run(double w, std::int64_t known, std::size_t nodes, Budget& budget) {
     const auto proved = [&] {
-        const auto limit = static_cast<std::int64_t>(std::floor(w * static_cast<double>(lower_bound_)));
+        const auto limit = cost_limit(w, lower_bound_);
         return known <= limit || (has_plan() && cost() <= limit);
     };
     while (!open_.empty()) {

@@ -5,13 +5,12 @@
 namespace mapf {
 
 bool SafeIntervalSearch::run(const Grid& grid, const Reservations& others, int start, int goal,
-                             const Distance* distance, int tolerance, int latest, Budget& budget) {
+                             const Distance* distance, int tolerance, Budget& budget) {
     others_ = &others;
     distance_ = distance;
     steps_ = grid.layout.steps();
     goal_ = goal;
     earliest_ = others.last_visit(goal) + 1;
-    latest_ = latest;
     tolerance_ = tolerance;
     states_.clear();
     reached_.clear();
@@ -69,7 +68,6 @@ void SafeIntervalSearch::enter(int from, int cell, const Interval& interval) {
 
 void SafeIntervalSearch::reach(int parent, int cell, int time, const Interval& interval, int meetings) {
     if (meetings > tolerance_) return;
-    if (time + distance_[cell] > latest_) return;
     auto& best = reached_(cell, interval.end);
     if (best.expanded <= time || (best.time <= time && best.meetings <= meetings)) return;
     if (meetings <= best.meetings) best = {best.expanded, time, meetings};

@@ -41,13 +41,18 @@ void run_jobs(std::size_t jobs, int threads, Interrupt& interrupt, const Work& w
     running = running > 0 ? running - 1 : 0;
     std::vector<std::jthread> helpers;
     helpers.reserve(running);
-    for (std::size_t helper = running; helper > 0; --helper)
-        helpers.emplace_back([&] {
-            serve(false);
-            const std::lock_guard lock(mutex);
-            --running;
-            finished.notify_one();
-        });
+    try {
+        for (std::size_t helper = running; helper > 0; --helper)
+            helpers.emplace_back([&] {
+                serve(false);
+                const std::lock_guard lock(mutex);
+                --running;
+                finished.notify_one();
+            });
+    } catch (...) {  // the system has no more threads for us
+        interrupt.request();
+        throw;
+    }
     serve(true);
     {
         std::unique_lock lock(mutex);

@@ -81,7 +81,7 @@ void distances_by_words(const Grid& grid, int goal, Distance* distance) {
 }
 
 // Steps from every cell to `goal` by breadth-first search, `unreachable` where there is no way. `queue` is scratch.
-// Throws std::overflow_error if a distance does not fit.
+// Throws std::invalid_argument if a distance does not fit.
 inline void distances_to(const Grid& grid, int goal, std::vector<Distance>& distance, std::vector<int>& queue) {
     const std::size_t size = grid.blocked.size();
     distance.resize(size);
@@ -101,7 +101,7 @@ inline void distances_to(const Grid& grid, int goal, std::vector<Distance>& dist
     while (head < tail) {
         const int cell = open[head++];
         const auto next = static_cast<Distance>(found[cell] + 1);
-        if (next == unreachable) throw std::overflow_error("a shortest path on this map is longer than 65533 steps");
+        if (next == unreachable) throw std::invalid_argument("a shortest path on this map is longer than 65533 steps");
         for (int action = 0; action < idle; ++action) {
             const int neighbour = cell + steps[action];
             const bool is_new = found[neighbour] == unreachable;

@@ -89,7 +89,7 @@ struct Case {
     std::vector<Distance> distances;      // (size, layout.size()), if they are asked for
 };
 
-// Throws std::overflow_error if a way is too long to be counted.
+// Throws std::invalid_argument if a way is too long to be counted.
 template <class T>
 Case case_of(const Teams<T>& teams, const std::uint8_t* grid, const std::int32_t* starts, const std::int32_t* goals,
                 int size) {

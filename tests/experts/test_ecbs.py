@@ -167,6 +167,21 @@ def test_the_time_limit_holds(side: int) -> None:
     assert min(overruns) < 0.02
 
 
+def test_the_time_limit_holds_where_one_robot_has_to_wait_very_long_for_another() -> None:
+    half = 200
+    grid = np.zeros((2 * half + 1, 2 * half + 1), bool)
+    grid[:, half] = True
+    grid[half, half] = False
+    gate = Instance(grid, [(half, half - 1), (half, 0)], [(half, half), (half, 2 * half)])
+    overruns = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        result = experts.solve(gate, w=1, time_limit=0.1)
+        overruns.append(time.perf_counter() - begin - 0.1)
+        assert result.status is Status.TIME_LIMIT
+    assert min(overruns) < 0.02
+
+
 @pytest.mark.parametrize(
     ("argument", "value", "error"),
     [
@@ -174,6 +189,7 @@ def test_the_time_limit_holds(side: int) -> None:
         ("w", math.nan, ValueError),
         ("w", math.inf, ValueError),
         ("w", "1.2", TypeError),
+        ("w", 10**400, ValueError),
         ("time_limit", 0, ValueError),
         ("time_limit", -1.0, ValueError),
         ("time_limit", math.nan, ValueError),
@@ -203,3 +219,17 @@ def test_other_things_are_no_instances() -> None:
 
 def test_infinite_limits_are_allowed() -> None:
     assert experts.solve(random_instance(seed=0), time_limit=math.inf, w=1e300).solved
+    crowd = random_instance(num_agents=60, density=0.2, seed=4)
+    assert experts.solve(crowd, w=1e300).solved
+    home = Instance(np.zeros((2, 2), bool), [(0, 0)], [(0, 0)])
+    assert experts.lacam(home).cost == 0
+
+
+def test_a_way_that_is_too_long_to_be_counted_is_refused() -> None:
+    rows = np.zeros((365, 365), bool)
+    rows[1::2] = True
+    rows[1::4, -1] = rows[3::4, 0] = False  # one way through all rows, there and back
+    near = Instance(rows, [(0, 0)], [(0, 1)])
+    with pytest.raises(ValueError, match="a shortest path on this map is longer than 65533 steps"):
+        experts.solve(near)
+    assert experts.lacam(near).cost == 1

@@ -64,6 +64,13 @@ def test_a_large_map() -> None:
     require_plan(instance, experts.lacam(instance))
 
 
+def test_the_bound_of_a_very_long_way_is_its_length() -> None:
+    long = Instance(np.zeros((1, 40_000), bool), [(0, 0)], [(0, 39_999)])
+    result = experts.lacam(long)
+    assert (result.cost, result.lower_bound) == (39_999, 39_999)
+    require_plan(long, result)
+
+
 def test_improvement_ends_with_the_time() -> None:
     instance = random_instance(height=32, width=32, density=0.2, num_agents=120, seed=0)
     begin = time.perf_counter()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import experts
-from experts import Result, Status
+from experts import Result, Status, many
 from mapf_env import Instance, Solution, random_instance
 
 INSTANCES = [random_instance(num_agents=8, seed=seed) for seed in range(30)]
@@ -80,6 +80,8 @@ def test_a_solver_of_your_own() -> None:
     home = Instance(np.zeros((2, 2), bool), [(0, 0)], [(0, 0)])
     (result,) = experts.solve_many([home], solver=stay)
     assert (result.status, result.cost, result.solved) == (Status.SOLVED, 0, True)
+    with pytest.raises(ValueError, match="lower_bound must be at most 0, got 1"):
+        Result.of(Solution(home.starts[None]), lower_bound=1)
     for threads in (1, 2):
         with pytest.raises(TypeError, match=r"must return an experts.Result, got NoneType"):
             experts.solve_many([home], solver=lambda _: None, threads=threads)  # pyright: ignore[reportArgumentType]
@@ -91,6 +93,17 @@ def test_unsolved_cases_are_reported_and_progress_is_told() -> None:
     results = experts.solve_many(mixed, threads=2, progress=lambda done, solved: told.append((done, solved)))
     assert [result.status for result in results] == [Status.SOLVED, Status.INFEASIBLE, Status.SOLVED]
     assert told == [(1, 1), (2, 1), (3, 2)]
+
+
+def test_progress_is_told_while_there_is_some(monkeypatch: pytest.MonkeyPatch) -> None:
+    solved: list[int] = []
+    solve_batch = many.solve_batch
+    monkeypatch.setattr(
+        many, "solve_batch", lambda cases, **how: (solved.append(len(cases)), solve_batch(cases, **how))[1]
+    )
+    when: list[int] = []
+    experts.solve_many([INSTANCES[0]] * 150, progress=lambda done, _: when.append(len(solved)))
+    assert when == [1] * 64 + [2] * 64 + [3] * 22
 
 
 def test_arguments_are_checked_before_the_first_result() -> None:
