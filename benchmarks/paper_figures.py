@@ -12,10 +12,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
+from gnn_policy.config import RECIPES
 from mapf_env.files import replacing, write_whole
 from mapf_env.generation import MapStyle
-from paper_experiment import LARGEST, PAPER, TEAMS, Experiment, Kind, Model, Scene
+from paper_experiment import LARGEST, LONGER, PAPER, TEAMS, Experiment, Kind, Model, Scene
 
 MEASURES = {
     "success_rate": "Success: all robots on goal at once",
@@ -57,7 +59,10 @@ def _figure2(experiment: Experiment, style: MapStyle) -> Figure:
     known = [N for N in experiment.options.train_on if N in PAPER]
     diagonal = [PAPER[N][TEAMS.index(N)] for N in known]
     panels[0].plot(known, diagonal, "kx", label="paper, K = 3")
-    panels[0].legend(fontsize=7)
+    panels[0].legend(fontsize=7, handlelength=4)
+    panels[0].set_title("2a")
+    panels[1].set_title("2b")
+    panels[1].yaxis.set_major_formatter(PercentFormatter(1.0))
     figure.suptitle(f"Figure 2, maps of {style}: what communication adds")
     return figure
 
@@ -140,7 +145,8 @@ def tables(experiment: Experiment) -> Iterator[str]:
             yield f"## {style.capitalize()}, {size} x {size}\n"
             cases = " or ".join(sorted({str(each["cases"]) for each in tested}))
             over = max(each["expert_over_bound"] for each in tested)
-            yield f"{cases} cases for each size of the team; the expert's flowtime is at most {over:.4f} x its bound.\n"
+            yield f"{cases} cases for each size of the team; the expert's flowtime is at most {over:.4f} x its bound."
+            yield f"Models have the encoder {RECIPES['full'].policy.encoder}.\n"
             if size == 20:
                 for row in experiment.rows:
                     yield from _figure3_table(experiment, style, row)
@@ -156,15 +162,22 @@ def _figure3_table(experiment: Experiment, style: MapStyle, row: str) -> Iterato
     found = {N: [experiment.row(Scene(style, size), Model(N, 3).name, row) for size in TEAMS] for N in PAPER}
     if not all(any(line) for line in found.values()):
         return
-    yield f"### Figure 3, {row}: success, its 95 % interval, the difference to the paper\n"
+    yield f"### Figure 3, {row}: success, its 95 % interval, the differences to the paper and to its longer version\n"
     yield "| trained on | " + " | ".join(map(str, TEAMS)) + " |"
     yield "|---|" + "---|" * len(TEAMS)
     for N, line in found.items():
         cells = [
-            f"{_cell('success_rate', each)} {each['success_rate']['mean'] - paper:+.3f}" if each else ""
-            for each, paper in zip(line, PAPER[N], strict=True)
+            f"{_cell('success_rate', each)} {each['success_rate']['mean'] - paper:+.3f} "
+            f"{each['success_rate']['mean'] - longer:+.3f}"
+            if each
+            else ""
+            for each, paper, longer in zip(line, PAPER[N], LONGER[N], strict=True)
         ]
         yield f"| {N} | " + " | ".join(cells) + " |"
+    here = success_rates(experiment, style, row)
+    if np.isfinite(here).all():
+        means = (here.mean(), *(np.mean(list(each.values())) for each in (PAPER, LONGER)))
+        yield "\nMean of the thirty cells: {:.4f}, the paper {:.4f}, its longer version {:.4f}.".format(*means)
     yield ""
 
 
@@ -196,10 +209,11 @@ def _table(
             cells = [_cell(measure, each) if each else "" for each in found]
             yield f"| {label} | " + " | ".join(cells) + " |"
     if measure == "success_rate" and scenes[0].size == 20:
-        for trained_on, values in PAPER.items():
-            line = dict(zip(TEAMS, values, strict=True))
-            cells = [f"{line[scene.num_agents]:.3f}" for scene in scenes]
-            yield f"| paper, trained on {trained_on} | " + " | ".join(cells) + " |"
+        for name, table in (("paper", PAPER), ("longer version", LONGER)):
+            for trained_on, values in table.items():
+                line = dict(zip(TEAMS, values, strict=True))
+                cells = [f"{line[scene.num_agents]:.3f}" for scene in scenes]
+                yield f"| {name}, trained on {trained_on} | " + " | ".join(cells) + " |"
 
 
 def _players(experiment: Experiment, baselines: Sequence[str]) -> list[tuple[str, str, str]]:

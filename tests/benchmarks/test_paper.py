@@ -195,10 +195,12 @@ def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
     assert "## Cells, 20 x 20" in text
     assert "90 cases for each size of the team" in text
     assert "flowtime is at most 1.0625 x its bound" in text
-    assert "| 10 |  |  |  | 0.750 [0.650, 0.850] -0.148 |  |  |" in text
+    assert "| 10 |  |  |  | 0.750 [0.650, 0.850] -0.148 -0.224 |  |  |" in text
+    assert "encoder lean" in text
     assert "| n12-k3 argmax |  |  |  |  | 0.750 [0.650, 0.850] |" in text
     assert "| n12-k3 argmax |  |  |  |  | +75.0% [+65.0, +85.0] |" in text
     assert "| PIBT* | 0.875 | 0.875 | 0.875 | 0.875 | 0.875 |" in text
+    assert "| longer version, trained on 10 | 0.991 | 0.983 | 0.979 | 0.974 | 0.968 |" in text
     assert "| paper, trained on 10 | 0.965 | 0.952 | 0.925 | 0.898 | 0.854 |" in text
     assert "sampled" not in text
     assert success_rates(whole, "cells", "argmax")[4, 4] == pytest.approx(0.75)
