@@ -179,10 +179,8 @@ def outcome(options: Options, name: str, seed: int) -> dict[str, Any] | None:
     folder = run_folder(options.runs, name, seed)
     if not (folder / "outcome.json").exists():
         return None
-    if differ := config_of(options, name, seed).differing(TrainConfig.load(folder / "config.json")):
-        raise FileExistsError(
-            f"{folder} holds a run of other settings ({', '.join(differ)}): choose another folder with --runs"
-        )
+    found = TrainConfig.load(folder / "config.json")
+    config_of(options, name, seed).refuse_other(found, f"{folder} holds a run of", "--runs")
     return json.loads((folder / "outcome.json").read_text())
 
 

@@ -189,7 +189,7 @@ class Experiment:
         file = WEIGHTS / f"{model.name.replace('-k3', '')}.safetensors"
         if not file.exists():
             return None
-        _refuse_other_settings(file, model, checkpoint.trained_with(file))
+        model.config.refuse_other(checkpoint.trained_with(file), f"{file} holds a model of", "--folder")
         return file
 
     def untrained(self) -> list[Model]:
@@ -204,7 +204,7 @@ class Experiment:
         """
         metrics, config = (self.run_of(model) / name for name in ("metrics.csv", "config.json"))
         if config.exists():
-            _refuse_other_settings(self.run_of(model), model, TrainConfig.load(config))
+            model.config.refuse_other(TrainConfig.load(config), f"{self.run_of(model)} holds a model of", "--folder")
         return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.epochs
 
     def cases_per_map(self, scene: Scene) -> int:
@@ -222,10 +222,3 @@ class Experiment:
             return None
         rows = {each["name"]: each for each in json.loads(path.read_text())["rows"]}
         return rows.get(row)
-
-
-def _refuse_other_settings(place: Path, model: Model, found: TrainConfig) -> None:
-    if differ := model.config.differing(found):
-        raise FileExistsError(
-            f"{place} holds a model of other settings ({', '.join(differ)}): choose another --folder, or delete it"
-        )

@@ -167,10 +167,21 @@ class TrainConfig:
             "test": (self.test_maps, self.cases_per_map),
         }[split]
 
-    def differing(self, other: TrainConfig) -> list[str]:
-        """The names of the settings that differ, but for where it runs: threads and device."""
-        own, others = asdict(self), asdict(other)
-        return [name for name in own if own[name] != others[name] and name not in ("threads", "device")]
+    def refuse_other(self, found: TrainConfig, what: str, option: str) -> None:
+        """Accept found settings only if they are these, but for where it runs: threads and device.
+
+        Args:
+            found: The settings of what is there.
+            what: The place and what it holds, as "runs/quick holds a run with".
+            option: That of the command which names the folder.
+
+        Raises:
+            FileExistsError: If others differ; it names them.
+        """
+        own, others = asdict(self), asdict(found)
+        differ = [name for name in own if own[name] != others[name] and name not in ("threads", "device")]
+        if differ:
+            raise FileExistsError(f"{what} other settings ({', '.join(differ)}): choose another folder with {option}")
 
     def save(self, path: Path) -> None:
         """Write the settings as JSON."""

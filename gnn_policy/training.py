@@ -100,10 +100,7 @@ def open_run(folder: Path, config: TrainConfig) -> None:
         return
     if not (folder / "config.json").is_file():
         raise FileExistsError(f"{folder} exists and is no training run: choose another folder with --run")
-    if differ := config.differing(TrainConfig.load(folder / "config.json")):
-        raise FileExistsError(
-            f"{folder} holds a run with other settings ({', '.join(differ)}): choose another folder with --run"
-        )
+    config.refuse_other(TrainConfig.load(folder / "config.json"), f"{folder} holds a run with", "--run")
     if (folder / "results.json").exists():
         raise FileExistsError(
             f"{folder} holds a finished run: evaluate it with `python -m gnn_policy.evaluate {folder}`, "

@@ -322,14 +322,20 @@ def test_new_goals_are_as_defined(
         left[robot] = new
 
 
-def test_new_goals_are_uniform_where_most_cells_are_blocked() -> None:
-    draws, grid = 4000, np.array([[0] * 8, [1] * 7 + [0]], bool)
-    maps = rules.bordered(np.broadcast_to(grid, (draws, 2, 8)), 1)
+def hits_of_new_goals(grid: npt.NDArray[np.bool_], draws: int) -> npt.NDArray[np.int_]:
+    """How often each cell is drawn by a robot in the first corner, which is its goal too."""
+    maps = rules.bordered(np.broadcast_to(grid, (draws, *grid.shape)), 1)
     start = np.zeros((draws, 1, 2), np.int32)
     arrived, counts = np.ones((draws, 1), np.bool_), np.ones((draws, 1), np.int32)
     drawn = rules.draw_goals(maps, 1, start, start, arrived, counts, np.arange(draws).astype(np.uint64))
-    hits = np.zeros((2, 8), int)
+    hits = np.zeros(grid.shape, int)
     np.add.at(hits, tuple(drawn[:, 0].T), 1)
+    return hits
+
+
+def test_new_goals_are_uniform_where_most_cells_are_blocked() -> None:
+    grid = np.array([[0] * 8, [1] * 7 + [0]], bool)
+    hits = hits_of_new_goals(grid, 4000)
     assert hits[0, 0] == hits[grid].sum() == 0
     assert all(400 < hit < 600 for hit in hits[hits > 0])  # 500 expected, standard deviation 21
 
@@ -338,12 +344,7 @@ def test_new_goals_are_uniform_where_cells_that_fit_are_very_rare() -> None:
     draws, grid = 3000, np.ones((40, 40), bool)
     free = [(0, 0), (0, 1), (1, 0), (1, 1), (39, 0)]
     grid[tuple(np.transpose(free))] = False
-    maps = rules.bordered(np.broadcast_to(grid, (draws, 40, 40)), 1)
-    start = np.zeros((draws, 1, 2), np.int32)
-    arrived, counts = np.ones((draws, 1), np.bool_), np.ones((draws, 1), np.int32)
-    drawn = rules.draw_goals(maps, 1, start, start, arrived, counts, np.arange(draws).astype(np.uint64))
-    hits = np.zeros((40, 40), int)
-    np.add.at(hits, tuple(drawn[:, 0].T), 1)
+    hits = hits_of_new_goals(grid, draws)
     assert hits.sum() == sum(hits[cell] for cell in free[1:4]) == draws, "no way leads to the last cell"
     assert all(870 < hits[cell] < 1130 for cell in free[1:4])  # 1000 expected, standard deviation 26
 
