@@ -2,7 +2,7 @@
 
 from experts.ecbs import solve
 from experts.lazy_constraints import lacam
-from experts.many import Solver, solve_many, solve_stream
+from experts.many import Solver, audited, solve_many, solve_stream
 from experts.paths import load_paths, save_paths
 from experts.prioritised_planning import prioritised
 from experts.priority_inheritance import pibt
@@ -13,6 +13,7 @@ __all__ = [
     "Result",
     "Solver",
     "Status",
+    "audited",
     "lacam",
     "load_paths",
     "pibt",

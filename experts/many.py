@@ -1,4 +1,4 @@
-"""Many instances: as a list, or as a stream that never holds more than a few at once."""
+"""Many instances: as a list, or as a stream that never holds more than a few at once; and solvers of your own."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import islice
+from typing import Any
 
 from experts import arguments
 from experts.ecbs import solve, solve_batch
@@ -17,7 +18,7 @@ from experts.result import Result
 from mapf_env.instance import Instance
 
 Solver = Callable[[Instance], Result]
-"""What a solver is: an instance in, a result out. Your own is one such function; `Result.of` makes its results."""
+"""A function of an instance that returns a result. `Result.of` makes the results of your own; they are audited."""
 
 Progress = Callable[[int, int], None]
 """Told after each result: how many instances are done, and how many of them are solved."""
@@ -44,7 +45,7 @@ def solve_many(
     Args:
         instances: The problems.
         solver: `"ecbs"`, `"lacam"`, `"prioritised"`, `"pibt"`, or a function of an instance, as `functools.partial`
-            makes one that fixes more options.
+            makes one that fixes more options; its plans are `audited`.
         w: As in `solve` for `"ecbs"` and as in `lacam` for `"lacam"`, with the default of each; others have none.
         threads: Native solvers do not hold Python's interpreter lock. A function runs in a pool of threads, or in the
             calling thread if there is one only.
@@ -58,9 +59,10 @@ def solve_many(
         One result for each instance, in their order; unsolved ones say why.
 
     Raises:
-        ValueError: If an argument is out of its range, or the solver has no `w` and one is given.
-        TypeError: If an argument has the wrong type, an element of `instances` is no `Instance`, or a solver's answer
-            no `Result`.
+        ValueError: If an argument is out of its range, the solver has no `w` and one is given, or a solver of your own
+            returns paths that do not solve the instance.
+        TypeError: If an argument has the wrong type, an element of `instances` is not an `Instance`, or a solver's
+            answer is not a `Result`.
         KeyboardInterrupt: At Ctrl-C, which stops ECBS, and any solver on one thread, at once. On more threads other
             solvers begin no further instance, and those that are running go on in the background to their end.
     """
@@ -130,13 +132,53 @@ def solve_stream(
         batch = partial(solve_batch, w=factor, threads=threads, **limits)
         results = _in_batches(problems, batch, backlog)
     else:
-        single = solver_named(solver, w=w, **limits) if isinstance(solver, str) else solver
-        if not callable(single):
-            raise TypeError(f"solver must be one of {', '.join(SOLVER_NAMES)} or a function, got {solver!r}")
-        if w is not None and single is solver:
+        single = solver_named(solver, w=w, **limits) if isinstance(solver, str) else audited(solver)
+        if w is not None and not isinstance(solver, str):
             raise ValueError("w is an option of named solvers: fix that of a function by functools.partial")
         results = _in_pool(problems, single, threads, backlog)
     return results if progress is None else _reporting(results, progress)
+
+
+def audited(solver: Solver) -> Solver:
+    """Wrap a solver of your own so that each plan is checked before anybody uses it.
+
+    `solve_many` and `solve_stream` do this with every function that they are given.
+
+    Args:
+        solver: A function of an instance, or a `functools.partial` of one.
+
+    Returns:
+        The same solver. It raises a TypeError if the answer is not a `Result`, and a ValueError if its paths do not
+        solve the instance; the message names the solver and what is wrong first.
+
+    Raises:
+        TypeError: If `solver` cannot be called.
+    """
+    if not callable(solver):
+        raise TypeError(f"solver must be one of {', '.join(SOLVER_NAMES)} or a function, got {solver!r}")
+    return partial(_audit, solver)
+
+
+def _audit(solver: Solver, instance: Instance) -> Result:
+    result = solver(instance)
+    if not isinstance(result, Result):
+        raise TypeError(
+            f"the solver {_name(solver)} must return an experts.Result, got {type(result).__name__} (see Result.of)"
+        )
+    violations = [] if result.solution is None else result.solution.violations(instance, most=1)
+    if violations:
+        raise ValueError(
+            f"the solver {_name(solver)} returned paths that do not solve the instance: {', '.join(violations)}"
+        )
+    return result
+
+
+def _name(solver: object) -> str:
+    """The module and name of a function or of the class of a callable object."""
+    while isinstance(solver, partial):
+        solver = solver.func
+    named: Any = solver if hasattr(solver, "__qualname__") else type(solver)
+    return f"{named.__module__}.{named.__qualname__}"
 
 
 def solver_named(name: str, *, w: float | None, time_limit: float, node_limit: int, seed: int) -> Solver:
@@ -170,27 +212,19 @@ def _in_batches(
 
 def _in_pool(instances: Iterator[Instance], solver: Solver, threads: int, backlog: int) -> Iterator[Result]:
     if threads == 1:
-        for instance in instances:
-            yield _answer(solver, instance)
+        yield from map(solver, instances)
         return
     pool = ThreadPoolExecutor(threads)
     try:
         waiting: deque[Future[Result]] = deque()
         while True:
             for instance in islice(instances, backlog - len(waiting)):
-                waiting.append(pool.submit(_answer, solver, instance))
+                waiting.append(pool.submit(solver, instance))
             if not waiting:
                 return
             yield waiting.popleft().result()
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _answer(solver: Solver, instance: Instance) -> Result:
-    result = solver(instance)
-    if not isinstance(result, Result):
-        raise TypeError(f"a solver must return an experts.Result, got {type(result).__name__} (see Result.of)")
-    return result
 
 
 def _reporting(results: Iterator[Result], progress: Progress) -> Iterator[Result]:

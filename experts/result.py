@@ -34,6 +34,10 @@ class Result:
         expansions: High-level nodes expanded (PIBT: joint steps; prioritised planning: orders tried).
         generated: High-level nodes generated, the same way.
         seconds: Wall-clock time of the search, distance tables included.
+
+    Raises:
+        ValueError: If status, cost or bound contradict the solution, or a number is negative.
+        TypeError: If an argument has the wrong type.
     """
 
     status: Status
@@ -44,6 +48,22 @@ class Result:
     generated: int
     seconds: float
 
+    def __post_init__(self) -> None:
+        arguments.instance_of(self.status, Status, "status")
+        if self.solution is not None:
+            arguments.instance_of(self.solution, Solution, "solution")
+        if (self.solution is None) == (self.status is Status.SOLVED):
+            given = "none" if self.solution is None else "one"
+            raise ValueError(f"a result has a solution exactly if its status is solved, got {self.status} with {given}")
+        paid = None if self.solution is None else self.solution.sum_of_costs
+        if self.cost != paid:
+            raise ValueError(f"the cost must be the solution's sum of costs, {paid}, got {self.cost!r}")
+        arguments.integer(self.lower_bound, "lower_bound", 0, paid)
+        for name in ("expansions", "generated"):
+            arguments.integer(getattr(self, name), name, 0)
+        if not arguments.number(self.seconds, "seconds") >= 0:
+            raise ValueError(f"seconds must not be negative, got {self.seconds}")
+
     @classmethod
     def of(cls, solution: Solution, *, lower_bound: int = 0, seconds: float = 0.0) -> Result:
         """What a solver of your own answers: a solution, and the lower bound it has proved, if any.
@@ -53,9 +73,6 @@ class Result:
             TypeError: If an argument has the wrong type.
         """
         arguments.instance_of(solution, Solution, "solution")
-        arguments.integer(lower_bound, "lower_bound", 0, solution.sum_of_costs)
-        if not arguments.number(seconds, "seconds") >= 0:
-            raise ValueError(f"seconds must not be negative, got {seconds}")
         return cls(Status.SOLVED, solution, solution.sum_of_costs, lower_bound, 0, 0, seconds)
 
     @property

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from itertools import combinations
-from typing import Any, Literal
+from functools import partial
+from itertools import chain, islice
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from mapf_env import arguments
-from mapf_env.instance import Instance
+from mapf_env.instance import Cells, Instance
+
+T = TypeVar("T")
+
+_CELLS_AT_ONCE = 1 << 20
+"""Cells of paths that an audit looks at in one go, which bounds its memory."""
 
 
 class Action(IntEnum):
@@ -100,62 +108,159 @@ class Solution:
             )
         return is_action.argmax(axis=2).astype(np.int8)
 
-    def conflicts(self) -> list[Conflict]:
-        """All vertex and swap conflicts, in the order of time.
+    def conflicts(self, most: int | None = None) -> list[Conflict]:
+        """Vertex and swap conflicts in the order of time: all of them, or the first `most`.
 
-        Time and memory grow with T N log(T N) and the number of conflicts, not with the square of N.
+        Time and memory grow with T N log(T N) and the number of conflicts returned, not with the square of N.
         """
-        found: list[Conflict] = []
-        cells = self.paths.astype(np.int64)
-        cells = cells[..., 0] << 32 | cells[..., 1] & 0xFFFFFFFF
-        for time, now in enumerate(cells):
-            found += [
-                Conflict("vertex", time, pair, _cell(self.paths[time, pair[0]])) for pair in _pairs_of_equals(now)
-            ]
-            if time == 0:
-                continue
-            before = cells[time - 1]
-            moved = np.flatnonzero(before != now)
-            ways = np.stack([np.minimum(before, now), np.maximum(before, now)], axis=1)[moved]
-            kinds = np.unique(ways, axis=0, return_inverse=True)[1].reshape(-1)
-            for i, j in _pairs_of_equals(kinds):
-                first, second = int(moved[i]), int(moved[j])
-                if before[first] == now[second]:
-                    found.append(Conflict("swap", time, (first, second), _cell(self.paths[time, first])))
-        return found
+        limit = None if most is None else arguments.integer(most, "most", 0)
+        return list(islice(chain.from_iterable(each.listed() for each in self._clashes()), limit))
 
-    def violations(self, instance: Instance) -> list[str]:
-        """All that keeps these paths from solving `instance`, in words; empty if they solve it.
+    def violations(self, instance: Instance, most: int | None = 20) -> list[str]:
+        """What keeps these paths from solving `instance`, in words; empty if they solve it.
+
+        If there are more than `most` violations, the list holds the first ones and ends with a line that counts the
+        rest. None lists all of them.
 
         Raises:
-            TypeError: If `instance` is none.
+            ValueError: If `most` is negative.
+            TypeError: If `instance` is not an `Instance`.
         """
+        limit = None if most is None else arguments.integer(most, "most", 0)
+        count, first = 0, list[str]()
+        for found in self._faults(instance):
+            count += found.number
+            first += islice(found.listed(), None if limit is None else limit - len(first))
+        return first if len(first) == count else [*first, f"and {count - len(first)} more"]
+
+    def count_violations(self, instance: Instance) -> int:
+        """Count what keeps these paths from solving `instance`; 0 if they solve it.
+
+        Raises:
+            TypeError: If `instance` is not an `Instance`.
+        """
+        return sum(found.number for found in self._faults(instance))
+
+    def _faults(self, instance: Instance) -> Iterator[_Found[str]]:
         arguments.instance_of(instance, Instance, "instance")
-        if self.paths.shape[1] != instance.num_agents:
-            return [f"{self.paths.shape[1]} paths for {instance.num_agents} agents"]
-        found = []
-        for robot in np.flatnonzero((self.paths[0] != instance.starts).any(axis=1)):
-            found.append(f"agent {robot} starts at {_cell(self.paths[0, robot])}, not {_cell(instance.starts[robot])}")
-        for robot in np.flatnonzero((self.paths[-1] != instance.goals).any(axis=1)):
-            found.append(f"agent {robot} ends at {_cell(self.paths[-1, robot])}, not {_cell(instance.goals[robot])}")
-        outside: npt.NDArray[np.bool_] = np.any((self.paths < 0) | (self.paths >= instance.grid.shape), axis=2)
-        inside = np.where(outside[..., None], 0, self.paths)
-        for time, robot in np.argwhere(outside | instance.grid[inside[..., 0], inside[..., 1]]):
-            found.append(f"agent {robot} is at {_cell(self.paths[time, robot])} at time {time}, which is no free cell")
-        for time, robot in np.argwhere(np.abs(np.diff(self.paths, axis=0)).sum(axis=2) > 1):
-            found.append(f"agent {robot} jumps in step {time}")
-        return found + [str(conflict) for conflict in self.conflicts()]
+        paths = self.paths
+        if paths.shape[1] != instance.num_agents:
+            yield _Found(1, lambda: [f"{paths.shape[1]} paths for {instance.num_agents} agents"])
+            return
+        for cells, expected, verb in ((paths[0], instance.starts, "starts"), (paths[-1], instance.goals, "ends")):
+            wrong = np.flatnonzero((cells != expected).any(axis=1))
+            yield _Found(len(wrong), partial(_misplaced, wrong, cells, expected, verb))
+        for time, part in self._parts(overlap=0):
+            outside: npt.NDArray[np.bool_] = np.any((part < 0) | (part >= instance.grid.shape), axis=2)
+            inside = np.where(outside[..., None], 0, part)
+            wrong = np.argwhere(outside | instance.grid[inside[..., 0], inside[..., 1]])
+            yield _Found(len(wrong), partial(_off_the_floor, wrong, part, time))
+        for time, part in self._parts(overlap=1):
+            wrong = np.argwhere(np.abs(np.diff(part.astype(np.int64), axis=0)).sum(axis=2) > 1)
+            yield _Found(len(wrong), partial(_jumps, wrong, time))
+        for clash in self._clashes():
+            yield _Found(clash.number, partial(map, str, clash.listed()))
+
+    def _clashes(self) -> Iterator[_Found[Conflict]]:
+        """The conflicts of each time, those of vertices first."""
+        for first, part in self._parts(overlap=1):
+            cells = part.astype(np.int64)
+            cells = cells[..., 0] << 32 | cells[..., 1] & 0xFFFFFFFF
+            shared, exchanged = _share_a_cell(cells), _may_exchange_cells(cells)
+            shared[0] &= first == 0  # else it was the last time of the part before
+            for k in np.flatnonzero(shared | exchanged).tolist():
+                if shared[k]:
+                    yield _clash("vertex", first + k, _in_the_same_cell(cells[k]), part[k])
+                if exchanged[k]:
+                    yield _clash("swap", first + k, _in_exchange(cells[k - 1], cells[k]), part[k])
+
+    def _parts(self, overlap: int) -> Iterator[tuple[int, Cells]]:
+        """The paths in parts of bounded memory, each with its first time; `overlap` times belong to two parts."""
+        steps = max(1, _CELLS_AT_ONCE // self.paths.shape[1])
+        for first in range(0, max(1, len(self.paths) - overlap), steps):
+            yield first, self.paths[first : first + steps + overlap]
 
     def __repr__(self) -> str:
         steps, robots = self.paths.shape[0] - 1, self.paths.shape[1]
         return f"Solution({robots} agents, {steps} steps, sum of costs {self.sum_of_costs}, makespan {self.makespan})"
 
 
-def _pairs_of_equals(values: npt.NDArray[np.integer]) -> list[tuple[int, int]]:
-    """All i < j with values[i] == values[j], ascending."""
+class _Found(NamedTuple, Generic[T]):
+    """A number of things, and a call that lists them one by one."""
+
+    number: int
+    listed: Callable[[], Iterable[T]]
+
+
+def _misplaced(robots: npt.NDArray[np.intp], cells: Cells, expected: Cells, verb: str) -> Iterator[str]:
+    for robot in robots:
+        yield f"agent {robot} {verb} at {_cell(cells[robot])}, not {_cell(expected[robot])}"
+
+
+def _off_the_floor(wrong: npt.NDArray[np.intp], part: Cells, first: int) -> Iterator[str]:
+    for time, robot in wrong:
+        yield f"agent {robot} is at {_cell(part[time, robot])} at time {first + time}, which is no free cell"
+
+
+def _jumps(wrong: npt.NDArray[np.intp], first: int) -> Iterator[str]:
+    for time, robot in wrong:
+        yield f"agent {robot} jumps in step {first + time}"
+
+
+def _share_a_cell(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Mark the times (T,) at which one of the cells (T, N) occurs twice."""
+    ordered = np.sort(cells, axis=1)
+    return (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+
+
+def _may_exchange_cells(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Mark all times (T,) at which two robots have exchanged cells (T, N), and rarely another one."""
+    scattered = cells.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    scattered ^= scattered >> np.uint64(29)
+    ways = scattered[1:] + scattered[:-1]  # the same in both directions
+    waiting = cells[1:] == cells[:-1]
+    ways[waiting] = np.arange(np.count_nonzero(waiting), dtype=np.uint64)  # unlike any other
+    return np.concatenate([[False], _share_a_cell(ways.view(np.int64))])
+
+
+def _in_the_same_cell(now: npt.NDArray[np.int64]) -> dict[int, list[int]]:
+    """Map each robot that shares its cell of `now` (N,) to all robots there, ascending."""
+    groups = (group.tolist() for group in _groups_of_equals(now))
+    return {robot: group for group in groups for robot in group}
+
+
+def _in_exchange(before: npt.NDArray[np.int64], now: npt.NDArray[np.int64]) -> dict[int, list[int]]:
+    """Map each robot to those that went from its cell of `now` (N,) to its cell of `before`, ascending."""
+    moved = np.flatnonzero(before != now)
+    ways = np.stack([np.minimum(before, now), np.maximum(before, now)], axis=1)[moved]
+    kinds = np.unique(ways, axis=0, return_inverse=True)[1].reshape(-1)
+    partners: dict[int, list[int]] = {}
+    for group in _groups_of_equals(kinds):
+        robots = moved[group]
+        onward = before[robots] < now[robots]
+        one, other = robots[onward].tolist(), robots[~onward].tolist()
+        partners |= dict.fromkeys(one, other) | dict.fromkeys(other, one)
+    return partners
+
+
+def _groups_of_equals(values: npt.NDArray[np.integer]) -> list[npt.NDArray[np.intp]]:
+    """Find the indices of values that occur more than once, value by value, ascending."""
     order = np.argsort(values, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(values[order])) + 1)
-    return sorted(pair for group in groups if len(group) > 1 for pair in combinations(group.tolist(), 2))
+    return [group for group in groups if len(group) > 1]
+
+
+def _clash(
+    kind: Literal["vertex", "swap"], time: int, partners: dict[int, list[int]], cells: Cells
+) -> _Found[Conflict]:
+    """The conflicts of each robot with its partners, each pair once."""
+
+    def listed() -> Iterator[Conflict]:
+        for robot in sorted(partners):
+            for partner in partners[robot][bisect_right(partners[robot], robot) :]:
+                yield Conflict(kind, time, (robot, partner), _cell(cells[robot]))
+
+    return _Found(sum(len(each) - bisect_right(each, robot) for robot, each in partners.items()), listed)
 
 
 def _cell(cell: npt.NDArray[np.int32]) -> tuple[int, int]:

@@ -1,5 +1,6 @@
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,6 +12,29 @@ from mapf_env import Instance, Solution, random_instance
 
 INSTANCES = [random_instance(num_agents=8, seed=seed) for seed in range(30)]
 IMPOSSIBLE = Instance(np.zeros((1, 3), bool), [(0, 0), (0, 2)], [(0, 2), (0, 0)])
+
+
+def stays(instance: Instance) -> Result:
+    """A solver that moves nobody."""
+    return Result.of(Solution(np.stack([instance.starts] * 3)))
+
+
+class Jumper:
+    """A solver that is an object and moves robots from start to goal in one step."""
+
+    def __call__(self, instance: Instance) -> Result:
+        return Result.of(Solution(np.stack([instance.starts, instance.goals])))
+
+
+def elsewhere(instance: Instance, shift: int) -> Result:
+    """A solver that begins in the wrong cells."""
+    return Result.of(Solution(np.stack([np.roll(instance.starts, shift, axis=0), instance.goals])))
+
+
+def through_walls(instance: Instance) -> Result:
+    """A solver that does not see obstacles and lets robots pass through each other."""
+    open_map = Instance(np.zeros_like(instance.grid), instance.starts, instance.goals)
+    return Result.of(experts.pibt(open_map).solution or Solution(instance.starts[None]))
 
 
 def costs(results: list[Result]) -> list[int | None]:
@@ -115,3 +139,62 @@ def test_arguments_are_checked_before_the_first_result() -> None:
         experts.solve_stream(INSTANCES, backlog=0)
     with pytest.raises(TypeError, match=r"instances\[1\] must be a mapf_env.Instance"):
         list(experts.solve_stream([INSTANCES[0], 7], solver="pibt"))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(
+    ("solver", "said"),
+    [
+        (stays, r"solver \S*test_many\.stays .* agent 0 ends at \(\d+, \d+\), not .*, and \d+ more"),
+        (Jumper(), r"solver \S*test_many\.Jumper .* agent 0 jumps in step 0, and \d+ more"),
+        (partial(elsewhere, shift=1), r"solver \S*test_many\.elsewhere .* agent 0 starts at"),
+        (through_walls, r"solver \S*test_many\.through_walls .* which is no free cell"),
+        (lambda _: Result.of(Solution(np.zeros((1, 1, 2), np.int32))), "1 paths for 8 agents"),
+        (
+            lambda instance: Result.of(Solution(np.stack([instance.starts, instance.starts[::-1], instance.goals]))),
+            "jumps|conflict",
+        ),
+    ],
+)
+def test_plans_of_your_own_solver_are_audited(solver: experts.Solver, said: str, threads: int) -> None:
+    instance = random_instance(num_agents=8, density=0.3, seed=3)
+    for ask in (
+        lambda: experts.audited(solver)(instance),
+        lambda: experts.solve_many([instance], solver=solver, threads=threads),
+        lambda: next(experts.solve_stream(iter([instance]), solver=solver, threads=threads)),
+    ):
+        with pytest.raises(ValueError, match=said):
+            ask()
+
+
+def test_a_sound_plan_passes_the_audit_and_so_does_the_lack_of_one() -> None:
+    for instance in (INSTANCES[0], IMPOSSIBLE):
+        expected, found = experts.lacam(instance), experts.audited(experts.lacam)(instance)
+        assert (found.status, found.cost, found.lower_bound) == (expected.status, expected.cost, expected.lower_bound)
+
+
+def test_a_conflict_alone_is_a_reason() -> None:
+    swap = Instance(np.zeros((1, 2), bool), [(0, 0), (0, 1)], [(0, 1), (0, 0)])
+    with pytest.raises(ValueError, match="do not solve the instance: swap conflict of agents 0 and 1"):
+        experts.solve_many([swap], solver=Jumper())
+
+
+def test_results_that_contradict_themselves_cannot_be_built() -> None:
+    solution = Solution(np.array([[[0, 0]], [[0, 1]]], np.int32))
+    sound = Result.of(solution, lower_bound=1)
+    for changes, said in (
+        ({"cost": 0}, "cost must be the solution's sum of costs, 1, got 0"),
+        ({"cost": None}, "cost must be .* got None"),
+        ({"solution": None}, "has a solution exactly if its status is solved, got solved with none"),
+        ({"status": Status.INFEASIBLE}, "got infeasible with one"),
+        ({"lower_bound": 2}, "lower_bound must be at most 1, got 2"),
+        ({"lower_bound": -1}, "lower_bound must be at least 0"),
+        ({"seconds": math.nan}, "seconds must not be negative"),
+        ({"expansions": -1}, "expansions must be at least 0"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            replace(sound, **changes)
+    with pytest.raises(TypeError, match=r"status must be a experts\.Status, got str"):
+        replace(sound, status="solved")
+    with pytest.raises(TypeError, match=r"solution must be a mapf_env\.Solution, got ndarray"):
+        replace(sound, solution=solution.paths)
