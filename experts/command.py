@@ -90,15 +90,15 @@ def _add_problem(parser: argparse.ArgumentParser, name: str) -> None:
     action = parser.add_argument(
         name,
         metavar="FILE",
-        help="a scenario (.scen), whose map is looked for beside it, a map (.map) for random robots, or a set of "
-        "instances (.json), as mapf_env.save_instances writes it",
+        help="a scenario (.scen), whose map is looked for beside it, a map (.map) for random robots, a set of "
+        "instances (.json), as mapf_env.save_instances writes it, or maps of POGEMA (.yaml)",
     )
     action.required = True
     parser.add_argument("--map", metavar="FILE.map", help="the map of the scenario, if it lies elsewhere")
     parser.add_argument(
         "--agents", type=int, metavar="N", help="the number of robots, the first of a file (default: all)"
     )
-    parser.add_argument("--index", type=int, metavar="I", help="which instance of a set, from 0 (default: 0)")
+    parser.add_argument("--index", type=int, metavar="I", help="which instance or map of a file, from 0 (default: 0)")
     parser.add_argument("--seed", type=int, default=0, help="of random robots and of the solver (default: 0)")
 
 

@@ -30,7 +30,8 @@ class Command:
     """Play a policy on a map of your own and write a page that replays it in any browser."""
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """A map (.map) in the MovingAI format, a scenario (.scen) beside its map, or a set of instances (.json)."""
+    """A map (.map) in the MovingAI format, a scenario (.scen) next to its map, a set of instances (.json), or maps of
+    POGEMA (.yaml)."""
     agents: int | None = None
     """How many robots: placed at random on a map, else the first ones of the file (all of them if not given)."""
     run: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: n12)")] = checkpoint.PACKAGED
@@ -38,7 +39,7 @@ class Command:
     map: Path | None = None
     """The map of a scenario, if it does not lie beside it."""
     index: int | None = None
-    """Which instance of a set, from 0; the first if not given."""
+    """Which instance or map of a file, from 0; the first if not given."""
     row: str = "stuck"
     """How to execute the policy, in the words of the rows of `python -m gnn_policy.evaluate`."""
     max_steps: int | None = None

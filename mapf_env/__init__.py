@@ -16,12 +16,13 @@ import pettingzoo
 from mapf_env.ascii_map import parse_instance, parse_map
 from mapf_env.batched_env import BatchedEnv, Observation, Step
 from mapf_env.config import EnvConfig
-from mapf_env.generation import Maze, Rooms, Warehouse, random_cases, random_instance, random_map, random_maps
+from mapf_env.generation import Maze, Rooms, Walls, Warehouse, random_cases, random_instance, random_map, random_maps
 from mapf_env.grid_v0 import ENV_ID, GridEnv, env, parallel_env
 from mapf_env.instance import Instance
 from mapf_env.instance_set import instance_hash, load_instances, save_instances
 from mapf_env.joint_v0 import JointEnv, joint_env
 from mapf_env.movingai import load_map, load_scen, save_map, save_scen
+from mapf_env.pogema_maps import PogemaMap, load_pogema_maps, parse_pogema_map
 from mapf_env.render import animate, draw
 from mapf_env.replay import Scene, replay, replay_scenes
 from mapf_env.rewards import SCHEMES, Rewards
@@ -41,11 +42,13 @@ __all__ = [
     "JointEnv",
     "Maze",
     "Observation",
+    "PogemaMap",
     "Rewards",
     "Rooms",
     "Scene",
     "Solution",
     "Step",
+    "Walls",
     "Warehouse",
     "animate",
     "communication_edges",
@@ -56,10 +59,12 @@ __all__ = [
     "joint_env",
     "load_instances",
     "load_map",
+    "load_pogema_maps",
     "load_scen",
     "parallel_env",
     "parse_instance",
     "parse_map",
+    "parse_pogema_map",
     "random_cases",
     "random_instance",
     "random_map",

@@ -36,6 +36,31 @@ class Maze:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Walls:
+    """Walls one cell thick that grow in steps of two cells; the style "walls" with its parts chosen.
+
+    They fill a map up to its density and always leave the free cells connected. With `Walls(segments=4, straight=0.5,
+    ring=True)` on 17 to 21 cells a side, odd sizes, and densities of 0.1 to 0.4 the maps resemble POGEMA's mazes.
+
+    Raises:
+        ValueError: If a part is out of its range.
+        TypeError: If a part has the wrong type.
+    """
+
+    segments: int = 2
+    """Steps of two cells that a wall grows, 1..9999; a step that meets another wall is left out."""
+    straight: float = 0.0
+    """Share of these steps that keep the direction of the step before; the others draw one of the four."""
+    ring: bool = False
+    """Keep the border of the map free, so that a corridor leads around it."""
+
+    def __post_init__(self) -> None:
+        _check_parts(self)
+        arguments.share(self.straight, "the straight of Walls")
+        arguments.flag(self.ring, "the ring of Walls")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rooms:
     """Square rooms between walls one cell thick, with a door between any two neighbours; the style "room".
 
@@ -71,8 +96,8 @@ class Warehouse:
         _check_parts(self)
 
 
-Style = MapStyle | Maze | Rooms | Warehouse
-_STYLE_OF: dict[type, MapStyle] = {Maze: "maze", Rooms: "room", Warehouse: "warehouse"}
+Style = MapStyle | Maze | Rooms | Walls | Warehouse
+_STYLE_OF: dict[type, MapStyle] = {Maze: "maze", Rooms: "room", Walls: "walls", Warehouse: "warehouse"}
 Seeds = npt.NDArray[np.uint64]
 
 
@@ -88,8 +113,8 @@ def random_maps(
         density: Share of obstacles; maps of the styles "cells" and "walls" have exactly round(density * H * W) of them,
             the others as many as the style has.
         style: "cells" blocks independent cells, "walls" builds short walls between cells with even coordinates as the
-            paper's released generator does, "empty" has no obstacles. "maze", "room" and "warehouse" are short for
-            `Maze()`, `Rooms()` and `Warehouse()`, whose fields are the sizes of their parts.
+            paper's released generator does, "empty" has no obstacles. "walls", "maze", "room" and "warehouse" are short
+            for `Walls()`, `Maze()`, `Rooms()` and `Warehouse()`, whose fields are the sizes of their parts.
 
     Raises:
         ValueError: If the density leaves no room, or the style cannot reach it, or an argument is out of its range.
@@ -174,13 +199,15 @@ def style_name(style: Any) -> MapStyle:
     """
     name = _STYLE_OF.get(type(style), style)
     if not isinstance(name, str) or name not in STYLES:
-        raise ValueError(f"style must be one of {', '.join(STYLES)}, or a Maze, Rooms or Warehouse, got {style!r}")
+        raise ValueError(
+            f"style must be one of {', '.join(STYLES)}, or a Maze, Rooms, Walls or Warehouse, got {style!r}"
+        )
     return name
 
 
-def _check_parts(parts: Maze | Rooms | Warehouse) -> None:
+def _check_parts(parts: Maze | Rooms | Walls | Warehouse) -> None:
     for name, size in asdict(parts).items():
-        if name == "loops":
+        if name in ("loops", "straight", "ring"):  # the parts that are no sizes
             continue
         if not 1 <= arguments.integer(size, f"the {name} of {type(parts).__name__}") <= 9999:
             raise ValueError(f"the {name} of {type(parts).__name__} must lie in 1..9999, got {size}")

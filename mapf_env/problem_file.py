@@ -9,16 +9,18 @@ from mapf_env.generation import random_instance
 from mapf_env.instance import Instance
 from mapf_env.instance_set import load_instances
 from mapf_env.movingai import load_map, load_scen
+from mapf_env.pogema_maps import load_pogema_maps
 
 
 def load_problem(file: PathLike, *, agents: int | None, map: PathLike | None, index: int | None, seed: int) -> Instance:
     """The instance that a file and the options beside it define; messages speak of the options by their names there.
 
     Args:
-        file: A scenario (.scen), a map (.map) on which robots are placed at random, or a set of instances (.json).
+        file: A scenario (.scen), a map (.map) on which robots are placed at random, a set of instances (.json), or maps
+            of POGEMA (.yaml) on which robots are placed as POGEMA places them.
         agents: `--agents`, how many robots: the first ones of a file, all of them if not given.
         map: `--map`, the map of a scenario that does not lie beside it.
-        index: `--index`, which instance of a set; the first if not given.
+        index: `--index`, which instance or map of a file; the first if not given.
         seed: `--seed`, of random places.
 
     Raises:
@@ -26,16 +28,22 @@ def load_problem(file: PathLike, *, agents: int | None, map: PathLike | None, in
         OSError: If the file cannot be read.
     """
     kind = Path(file).suffix.lower()
-    if kind not in (".scen", ".map", ".json"):
-        raise ValueError(f"{file} must be a map (.map), a scenario (.scen) or a set of instances (.json)")
+    if kind not in (".scen", ".map", ".json", ".yaml"):
+        raise ValueError(
+            f"{file} must be a map (.map), a scenario (.scen), a set of instances (.json) or maps of POGEMA (.yaml)"
+        )
     if map is not None and kind != ".scen":
         raise ValueError(f"--map goes with a scenario only: {file} has its map already")
-    if index is not None and kind != ".json":
-        raise ValueError(f"--index goes with a set of instances (.json) only, and {file} is none")
+    if index is not None and kind not in (".json", ".yaml"):
+        raise ValueError(
+            f"--index goes with a set of instances (.json) or maps of POGEMA (.yaml) only, not with {file}"
+        )
     if kind == ".scen":
         return load_scen(file, agents, map)
     if kind == ".json":
         return _of_set(file, index or 0, agents)
+    if kind == ".yaml":
+        return _of_pogema(file, index or 0, agents, seed)
     if agents is None:
         raise ValueError("robots on a map are placed at random: give --agents N (and --seed S)")
     return random_instance(grid=load_map(file), num_agents=agents, seed=seed)
@@ -54,3 +62,14 @@ def _of_set(file: PathLike, index: int, agents: int | None) -> Instance:
             f"give --agents in 1..{instance.num_agents}"
         )
     return Instance(instance.grid, instance.starts[:agents], instance.goals[:agents])
+
+
+def _of_pogema(file: PathLike, index: int, agents: int | None, seed: int) -> Instance:
+    maps = list(load_pogema_maps(file).values())
+    if not 0 <= index < len(maps):
+        raise ValueError(f"{file} holds {len(maps)} maps, counted from 0: there is no --index {index}")
+    if agents is not None:
+        return maps[index].instance(agents, seed)
+    if not len(maps[index].starts):
+        raise ValueError("robots are placed on a map of POGEMA: give --agents N (and --seed S)")
+    return maps[index].drawn_instance()

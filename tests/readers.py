@@ -21,16 +21,23 @@ import numpy as np
 GRID = [[0, 0, 1, 0], [0, 0, 0, 1], [1, 1, 0, 0]]
 MAP = b"type octile\nheight 3\nwidth 4\nmap\n..@.\nGS.T\nOW..\n"
 SCEN = b"version 1\n0\ta.map\t4\t3\t0\t0\t2\t1\t2.41421356\n1\ta.map\t4\t3\t1\t1\t3\t2\t2.41421356\n"
+YAML = b"'one': |-\n  @.!\n  $#.\n# marked\ntwo: |\n    aB.\n    #bA\n"
 
 atheris: Any = importlib.import_module("atheris") if __name__ == "__main__" else None
 with atheris.instrument_imports(include=["mapf_env"]) if atheris else nullcontext():
     import mapf_env
 
 Reader = Callable[[Path], Any]
-READERS: dict[str, Reader] = {"map": mapf_env.load_map, "scen": mapf_env.load_scen, "json": mapf_env.load_instances}
+READERS: dict[str, Reader] = {
+    "map": mapf_env.load_map,
+    "scen": mapf_env.load_scen,
+    "json": mapf_env.load_instances,
+    "yaml": lambda path: [each.grid for each in mapf_env.load_pogema_maps(path).values()],
+}
 WHERE = {
     "map": r"line \d+",
     "scen": r"line (\d+|i \+ 2)",
+    "yaml": r"line \d+",
     "json": r"line \d+ column \d+|(map|instance) \d+|expected|position \d+|recursion|digits",
 }
 """How the message of an error names the place, for each kind of file."""
@@ -40,7 +47,7 @@ def samples(folder: Path) -> dict[str, bytes]:
     """A sound file of each kind."""
     instance = mapf_env.Instance(GRID, [(0, 0), (1, 1)], [(1, 2), (2, 3)])
     mapf_env.save_instances(folder / "sample", [instance, instance.at([(1, 0), (0, 1)])])
-    return {"map": MAP, "scen": SCEN, "json": (folder / "sample").read_bytes()}
+    return {"map": MAP, "scen": SCEN, "json": (folder / "sample").read_bytes(), "yaml": YAML}
 
 
 def faults(kind: str, content: bytes, folder: Path) -> list[str]:
@@ -56,7 +63,7 @@ def faults(kind: str, content: bytes, folder: Path) -> list[str]:
         return unnamed if re.search(WHERE[kind], said) else [*unnamed, f"no place is named: {said}"]
     except Exception as error:
         return [f"{type(error).__name__}: {error}"]
-    return [fault for each in (found if kind == "json" else [found]) for fault in unsound(each)]
+    return [fault for each in (found if isinstance(found, list) else [found]) for fault in unsound(each)]
 
 
 def unsound(found: Any) -> list[str]:

@@ -108,12 +108,13 @@ Out<std::int32_t> distances(In<bool, 2> grid, In<std::int32_t, 2> cells) {
 }
 
 Out<bool> random_maps(In<std::uint64_t, 1> seeds, int height, int width, int obstacles, int kind, int corridor_width,
-                      double loops, int room_size, int shelf_length, int shelf_depth) {
+                      double loops, int room_size, int shelf_length, int shelf_depth, int segments, double straight,
+                      bool ring) {
     auto [grid, out] = make_array<bool>({seeds.shape(0), static_cast<std::size_t>(height), static_cast<std::size_t>(width)});
     require(kind >= 0 && kind <= static_cast<int>(mapf::Style::empty), "there is no such style");
-    require(std::min({corridor_width, room_size, shelf_length, shelf_depth}) >= 1, "the parts of a map have a size");
+    require(std::min({corridor_width, room_size, shelf_length, shelf_depth, segments}) >= 1, "the parts of a map have a size");
     const auto style = static_cast<mapf::Style>(kind);
-    const mapf::Parts parts{corridor_width, loops, room_size, shelf_length, shelf_depth};
+    const mapf::Parts parts{corridor_width, loops, room_size, shelf_length, shelf_depth, segments, straight, ring};
     nb::gil_scoped_release release;
     for (std::size_t b = 0; b < seeds.shape(0); ++b) {
         mapf::Random random(mapf::seed_for(mapf::Use::map, seeds(b)));
@@ -396,7 +397,8 @@ NB_MODULE(_native, m) {
     const mapf::Parts parts;
     m.def("random_maps", &random_maps, "seeds"_a, "height"_a, "width"_a, "obstacles"_a, "style"_a,
           "corridor_width"_a = parts.corridor_width, "loops"_a = parts.loops, "room_size"_a = parts.room_size,
-          "shelf_length"_a = parts.shelf_length, "shelf_depth"_a = parts.shelf_depth,
+          "shelf_length"_a = parts.shelf_length, "shelf_depth"_a = parts.shelf_depth, "segments"_a = parts.segments,
+          "straight"_a = parts.straight, "ring"_a = parts.ring,
           "(B, H, W) bool maps with connected free cells, one for each seed; with that many obstacles if the style takes any.");
     m.def("place_agents", &place_agents, "seeds"_a, "grids"_a, "num_agents"_a,
           "Starts and goals (B, N, 2) int32, uniform over the largest connected region of each grid (B, H, W).");

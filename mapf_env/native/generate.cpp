@@ -114,21 +114,28 @@ void add_cells(MapBuilder& map, int obstacles, Random& random) {
             if (map.obstacles() < obstacles) map.try_block(cell);
 }
 
-// Whether there was room: walls that happen to stand badly leave none for others.
-bool add_walls(MapBuilder& map, int obstacles, Random& random) {
-    constexpr int segments = 2;
+// Returns whether there was room: walls that happen to stand badly leave none for others.
+bool add_walls(MapBuilder& map, const Parts& parts, int obstacles, Random& random) {
+    const long straight_of_thousand = std::lround(1000 * parts.straight);
     const auto& layout = map.layout();
-    const int pillar_rows = (layout.height + 1) / 2, pillar_cols = (layout.width + 1) / 2;
+    // Pillars stand on every second row and column, from the first one or inside a free border.
+    const int first = parts.ring ? 1 : 0;
+    const int pillar_rows = (layout.height + 1) / 2 - first, pillar_cols = (layout.width + 1) / 2 - first;
+    if (pillar_rows == 0 || pillar_cols == 0) return obstacles == 0;
+    const auto is_pillar = [&](int row, int col) {
+        return row >= first && row < layout.height - first && col >= first && col < layout.width - first;
+    };
     const int patience = 16 * pillar_rows * pillar_cols;
     int fruitless = 0;
     while (map.obstacles() < obstacles) {
         const int before = map.obstacles();
-        int row = 2 * random.below(pillar_rows), col = 2 * random.below(pillar_cols);
+        int row = first + 2 * random.below(pillar_rows), col = first + 2 * random.below(pillar_cols), direction = 0;
         map.try_block(layout.cell(row, col));
-        for (int segment = 0; segment < segments; ++segment) {
-            const int direction = random.below(idle);
+        for (int segment = 0; segment < parts.segments; ++segment) {
+            const bool turns = segment == 0 || straight_of_thousand == 0 || random.below(1000) >= straight_of_thousand;
+            if (turns) direction = random.below(idle);
             const int next_row = row + 2 * row_step[direction], next_col = col + 2 * col_step[direction];
-            if (!layout.contains(next_row, next_col) || map.blocked(layout.cell(next_row, next_col))) continue;
+            if (!is_pillar(next_row, next_col) || map.blocked(layout.cell(next_row, next_col))) continue;
             const int link = layout.cell(row + row_step[direction], col + col_step[direction]);
             if (map.obstacles() < obstacles) map.try_block(link);
             if (map.obstacles() < obstacles) map.try_block(layout.cell(next_row, next_col));
@@ -141,12 +148,12 @@ bool add_walls(MapBuilder& map, int obstacles, Random& random) {
     return true;
 }
 
-MapBuilder map_of_walls(int height, int width, int obstacles, Random& random) {
+MapBuilder map_of_walls(int height, int width, const Parts& parts, int obstacles, Random& random) {
     constexpr int attempts = 20;
     int most = 0;
     for (int attempt = 0; attempt < attempts; ++attempt) {
         MapBuilder map(height, width);
-        if (add_walls(map, obstacles, random)) return map;
+        if (add_walls(map, parts, obstacles, random)) return map;
         most = std::max(most, map.obstacles());
     }
     throw std::invalid_argument("walls fill at most about " + std::to_string(most) + " of the " +
@@ -248,7 +255,7 @@ Grid random_map(Style style, const Parts& parts, int height, int width, int obst
             throw std::invalid_argument(std::to_string(obstacles) + " obstacles leave no free cell on a " +
                                         std::to_string(height) + "x" + std::to_string(width) +
                                         " map: lower the density");
-        if (style == Style::walls) return map_of_walls(height, width, obstacles, random).finish();
+        if (style == Style::walls) return map_of_walls(height, width, parts, obstacles, random).finish();
         MapBuilder map(height, width);
         add_cells(map, obstacles, random);
         return std::move(map).finish();

@@ -8,7 +8,7 @@ namespace mapf {
 
 enum class Style {
     cells,  // obstacles are independent cells
-    walls,  // obstacles are short walls between cells with even coordinates, as in the paper's released generator
+    walls,  // walls that grow between cells with even coordinates, as in the paper's released generator
     maze,       // corridors
     room,       // square rooms with a door between any two neighbours
     warehouse,  // shelves
@@ -21,6 +21,9 @@ struct Parts {
     double loops = 0.1;      // share of a maze's walls between two corridors that is opened, beyond what connects it
     int room_size = 5;
     int shelf_length = 10, shelf_depth = 2;
+    int segments = 2;       // steps of two cells that a wall grows
+    double straight = 0.0;  // share of these steps that keep the direction of the step before
+    bool ring = false;      // walls leave the map's border free
 };
 
 // A map whose free cells are connected; of the styles cells and walls with exactly `obstacles` obstacles.

@@ -97,6 +97,7 @@ CALLS: dict[str, Any] = {
     "Rewards": (Rewards, {}, dict.fromkeys(Rewards.__dataclass_fields__, FINITE)),
     "Maze": (mapf_env.Maze, {}, {"corridor_width": COUNT_32_BITS, "loops": SHARE}),
     "Rooms": (mapf_env.Rooms, {}, {"room_size": COUNT_32_BITS}),
+    "Walls": (mapf_env.Walls, {}, {"segments": COUNT_32_BITS, "straight": SHARE, "ring": FLAG}),
     "Warehouse": (
         mapf_env.Warehouse,
         {},
@@ -254,7 +255,9 @@ CALLS: dict[str, Any] = {
     "instance_hash": (mapf_env.instance_hash, {"instance": INSTANCE}, {"instance": OBJECT}),
     "parse_map": (mapf_env.parse_map, {"drawing": "A.a"}, {"drawing": (*STRING, "")}),
     "parse_instance": (mapf_env.parse_instance, {"drawing": "A.a"}, {"drawing": (*STRING, "")}),
+    "parse_pogema_map": (mapf_env.parse_pogema_map, {"drawing": "aA."}, {"drawing": (*STRING, "")}),
     "load_map": (mapf_env.load_map, {"path": "a.map"}, {"path": PATH}),
+    "load_pogema_maps": (mapf_env.load_pogema_maps, {"path": "a.yaml"}, {"path": PATH}),
     "save_map": (mapf_env.save_map, {"path": "b.map", "grid": GRID}, {"path": PATH, "grid": ARRAY}),
     "load_scen": (
         mapf_env.load_scen,
@@ -282,6 +285,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mapf_env.save_map("a.map", GRID)
     mapf_env.save_scen("a.scen", INSTANCE, "a.map")
     mapf_env.save_instances("a.json", [INSTANCE])
+    Path("a.yaml").write_text("one: |-\n  ..\n")
 
 
 @pytest.mark.usefixtures("files")
@@ -302,6 +306,7 @@ def test_every_public_call_is_among_these() -> None:
         "JointEnv",
         "MOVES",
         "Observation",
+        "PogemaMap",
         "SCHEMES",
         "Scene",
         "Step",

@@ -18,6 +18,7 @@ TOKENS = [
         + b"m"
         * 300
         + b' [ ] { } , : " null true '
+        b"one: |- $ ! ' a A # "
         b"[] [[0,0]] [[0.5,0]] [[1,2,3]] {} starts goals sha256 maps instances [[9223372036854775808,0]]"
     ).split(b" "),
 ]
