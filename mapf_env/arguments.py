@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 T = TypeVar("T")
 
-_INT32 = np.iinfo(np.int32)
+_INT32, _INT64 = np.iinfo(np.int32), np.iinfo(np.int64)
 MOST_INT = int(_INT32.max)
 """The native core counts robots, steps and a map's cells, its border included, in 32 bits."""
 MOST_THREADS = 1024
@@ -102,6 +102,20 @@ def array(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
         raise ValueError(f"{name} must be an array, but its rows differ in length: make them equally long") from None
 
 
+def numbers(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
+    """`values` as an array, which must not mix numbers with True and False; integers beyond 64 bits are cut off."""
+    found = array(values, name)
+    if found.dtype != np.bool_ and not isinstance(values, np.ndarray) and _holds_bool(values):
+        raise TypeError(f"{name} must be numbers, got True or False among them")
+    if found.dtype == np.object_ or (found.dtype.kind == "f" and isinstance(values, list | tuple)):
+        try:  # integers that NumPy has no common type for, such as 1 and 2**63
+            exact = [operator.index(value) for value in np.array(values, np.object_).ravel().tolist()]
+        except TypeError:
+            return found
+        found = np.array([min(max(value, _INT64.min), _INT64.max) for value in exact], np.int64).reshape(found.shape)
+    return found
+
+
 def shaped(
     values: npt.ArrayLike, name: str, shape: str, meaning: str = "", *, filled: bool = False
 ) -> npt.NDArray[Any]:
@@ -121,7 +135,7 @@ def cells(
     values: npt.ArrayLike, name: str, shape: str, meaning: str = "", *, filled: bool = False
 ) -> npt.NDArray[np.int32]:
     """A contiguous copy of rows and columns as int32; beyond 32 bits they lie off every map and are cut off there."""
-    found = shaped(values, name, shape, meaning, filled=filled)
+    found = shaped(numbers(values, name), name, shape, meaning, filled=filled)
     if found.dtype.kind not in "iu":
         raise TypeError(f"{name} must be integers, got dtype {found.dtype}")
     within = found if found.dtype == np.int32 else np.clip(found, _INT32.min, _INT32.max)
@@ -135,8 +149,14 @@ def _axes(shape: str) -> tuple[int | None, ...]:
     return tuple(int(axis) if axis.isdigit() else None for axis in axes)
 
 
+def _holds_bool(values: object) -> bool:
+    if isinstance(values, list | tuple):
+        return any(map(_holds_bool, values))
+    return isinstance(values, bool) or "bool" in str(getattr(values, "dtype", ""))  # a tensor's dtype is torch.bool
+
+
 def _as_int(value: object, name: str) -> int:
-    if not isinstance(value, bool):
+    if not _holds_bool(value):
         try:
             return operator.index(value)  # pyright: ignore[reportArgumentType]
         except TypeError:

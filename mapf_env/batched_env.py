@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,7 +45,7 @@ class Step(NamedTuple):
     replaced: npt.NDArray[np.bool_]
     """(B, N) the shield replaced the robot's action."""
     arrived: npt.NDArray[np.bool_]
-    """(B, N) the robot has come to its goal in this step; in lifelong tasks their sum is the throughput."""
+    """(B, N) the robot has moved onto its goal in this step; in lifelong tasks their sum is the throughput."""
     final_observation: Observation | None = None
     """With autoreset SAME_STEP the last observations of the teams that have ended, in their order, if any have."""
 
@@ -97,6 +97,21 @@ class BatchedEnv:
         self._dtype = np.dtype(config.dtype)
         self._state = TeamState.empty(num_envs, config)
         self._bind()
+
+    def on_maps_of(self, config: EnvConfig, shape: tuple[int, int]) -> BatchedEnv:
+        """Return environments for maps of `shape` whose streams of seeds go on from here; these, if they fit.
+
+        They have the settings of `config`. On maps of another size than it names only given instances can be played.
+        """
+        if shape == (self.config.height, self.config.width):
+            return self
+        settings = {each.name: getattr(config, each.name) for each in fields(config)}
+        if shape != (config.height, config.width):
+            settings |= {"height": shape[0], "width": shape[1], "density": 0.0, "style": "empty"}
+        other = BatchedEnv(self.num_envs, threads=self.threads, autoreset=self.autoreset, **settings)
+        for name in ("streams", "episodes", "started"):
+            getattr(other._state, name)[:] = getattr(self._state, name)
+        return other
 
     def _bind(self) -> None:
         config = self.config
@@ -233,7 +248,7 @@ class BatchedEnv:
             RuntimeError: Before the first reset, or if a team has ended and was not reset.
         """
         observation = self.buffers() if out is None else out
-        final = self.advance(arguments.array(actions, "actions"), observation)
+        final = self.advance(arguments.numbers(actions, "actions"), observation)
         state = self._state
         return Step(
             observation,

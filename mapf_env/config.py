@@ -34,9 +34,9 @@ class EnvConfig:
     num_agents: int = 10
     """Robots N in a team."""
     height: int = 20
-    """Rows of the random maps."""
+    """Rows of random maps."""
     width: int = 20
-    """Columns of the random maps."""
+    """Columns of random maps."""
     density: float = 0.1
     """Share of obstacles on the random maps."""
     style: Style = "cells"
@@ -57,7 +57,7 @@ class EnvConfig:
     shield: Literal["idle", "pibt"] = "idle"
     """Collision shielding: "idle" is the paper's, "pibt" pushes robots aside by priority."""
     task: Literal["one_shot", "lifelong"] = "one_shot"
-    """"lifelong": a robot that arrives gets a new goal, and only max_cycles ends the episode."""
+    """"lifelong": a robot on its goal gets a new one at the end of the step, and only max_cycles ends the episode."""
     reward: str | Rewards = "flowtime"
     """A scheme of `mapf_env.SCHEMES`, or `Rewards` of one's own."""
     max_cycles: int = 128

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import sys
-import time
 from typing import Any, Literal
 
 import numpy as np
@@ -14,10 +12,10 @@ from gymnasium import spaces
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from mapf_env import _native, arguments, rules
-from mapf_env.batched_env import BatchedEnv
+from mapf_env.batched_env import BatchedEnv, Observation
 from mapf_env.config import EnvConfig
 from mapf_env.instance import Instance
-from mapf_env.pixels import picture, text
+from mapf_env.pixels import RENDER_MODES, RenderMode, Screen
 
 ENV_ID = "mapf/grid-v0"
 
@@ -37,13 +35,13 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         reuse_buffers: Return the same dictionaries and arrays at every step, overwritten; faster, for loops that keep
             nothing.
         render_mode: "ansi" gives text, "rgb_array" a picture (H', W', 3), "human" prints the text at each step; in a
-            terminal each state takes the place of the one before, `metadata["render_fps"]` times a second.
+            terminal each state replaces the one before, `metadata["render_fps"]` times a second.
         settings: Fields of `mapf_env.EnvConfig`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
         "name": "mapf_grid_v0",
-        "render_modes": ["ansi", "rgb_array", "human"],
+        "render_modes": list(RENDER_MODES),
         "render_fps": 4,
         "is_parallelizable": True,
     }
@@ -54,20 +52,19 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         observation: Literal["dict", "box"] = "dict",
         preferences: bool = False,
         reuse_buffers: bool = False,
-        render_mode: Literal["ansi", "rgb_array", "human"] | None = None,
+        render_mode: RenderMode | None = None,
         **settings: Any,
     ) -> None:
         arguments.choice(observation, ("dict", "box"), "observation")
         arguments.flag(preferences, "preferences")
         arguments.flag(reuse_buffers, "reuse_buffers")
-        if render_mode is not None:
-            arguments.choice(render_mode, self.metadata["render_modes"], "render_mode")
         self.config = config = EnvConfig(**settings)  # which has none of the options of a batch alone
         self._batch = BatchedEnv(1, **settings)
         if preferences and config.shield != "pibt":
             raise ValueError('preferences over all five moves need shield="pibt"')
         self._observation, self._preferences, self._reuse = observation, preferences, reuse_buffers
         self.render_mode = render_mode
+        self._screen = Screen(render_mode, self.metadata["render_fps"])
         N, (H, W) = config.num_agents, (config.height, config.width)
         self.possible_agents = [f"agent_{i}" for i in range(N)]
         self.agents: list[str] = []
@@ -82,7 +79,6 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self._masks_shape = (N, 5)
         self._memory: Any = _native.MemoryFloat32 if config.dtype == "float32" else _native.MemoryUint8
         self._reused: _Reused | None = None
-        self._shown_lines = 0
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_reused": None}  # its dictionaries share the memory of its arrays
@@ -129,9 +125,17 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
 
         Raises:
             RuntimeError: Before the first reset.
+            ValueError: If the episode's instance has a map of another size than the environment's H x W.
         """
         if not self._batch.began:
             raise RuntimeError("there is no state before the first reset: call reset()")
+        (height, width), (H, W) = self.grid.shape, self.state_space.shape[1:]
+        if (height, width) != (H, W):
+            raise ValueError(
+                f"the state has the size of the environment's maps, {H}x{W}, but this episode is played on one of "
+                f"{height}x{width}: make the environment with height={height}, width={width}, or read grid, positions "
+                "and goals"
+            )
         planes = np.zeros(self.state_space.shape, np.float32)
         planes[0] = self.grid
         numbers = np.arange(1, self._batch.num_agents + 1, dtype=np.float32) / np.float32(self._batch.num_agents)
@@ -142,18 +146,19 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begin an episode: a fresh random instance, or `options["instance"]`.
+        """Begin an episode: a fresh random instance, or `options["instance"]` with a map of any size.
 
         Raises:
-            ValueError: If the instance does not fit the environment.
-            TypeError: If the seed is no integer, `options` no dictionary or `options["instance"]` no `Instance`.
+            ValueError: If the instance has another number of agents than the environment.
+            TypeError: If the seed is not an integer, `options` not a dictionary or `options["instance"]` not an
+                `Instance`.
         """
         seed, instance = None if seed is None else arguments.seed(seed), instance_asked_for(options)
         if self._reuse and self._reused is None:
             self._reused = _Reused(self)
         reused = self._reused
         buffers = self._batch.buffers() if reused is None else reused.buffers
-        self._batch.reset(seed, instances=None if instance is None else [instance], out=buffers)
+        self._batch = begun(self._batch, self.config, seed, instance, buffers)
         self.agents = list(self.possible_agents)
         if reused is None:
             observations, infos, memory = self._fresh(*buffers)
@@ -193,7 +198,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         if not self._preferences:
             ended = stepper.step_agents(actions, memory, agents, rewards, terminated, truncated, infos)
         if ended is None:
-            batch.advance(np.array([self._checked(actions)]), buffers)
+            batch.advance(arguments.numbers([self._checked(actions)], "actions"), buffers)
             ended = stepper.outcome_by_agent(memory, agents, rewards, terminated, truncated, infos)
         if ended:
             self.agents = []
@@ -207,25 +212,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         Raises:
             RuntimeError: Before the first reset.
         """
-        if self.render_mode is None:
-            return None
-        if not self._batch.began:
-            raise RuntimeError("there is nothing to render before the first reset: call reset()")
-        if self.render_mode == "rgb_array":
-            return picture(self.grid, self.positions, self.goals)
-        shown = text(self.grid, self.positions, self.goals)
-        if self.render_mode == "ansi":
-            return shown
-        self._show(shown)
-        return None
-
-    def _show(self, shown: str) -> None:
-        terminal = sys.stdout.isatty()
-        if terminal and self._shown_lines:
-            time.sleep(1 / self.metadata["render_fps"])
-            print(f"\x1b[{self._shown_lines}F\x1b[J", end="")  # up to the first line of the picture before, and clear
-        print(shown, flush=True)
-        self._shown_lines = shown.count("\n") + 1
+        return self._screen.show(self._batch)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -273,6 +260,20 @@ def fov_space(config: EnvConfig) -> spaces.Box:
     return spaces.Box(bounds[0], bounds[1], shape, dtype)
 
 
+def begun(
+    batch: BatchedEnv, config: EnvConfig, seed: int | None, instance: Instance | None, out: Observation | None = None
+) -> BatchedEnv:
+    """A batch of one team at the beginning of an episode: `batch`, or its heir on maps of the instance's size.
+
+    Raises:
+        ValueError: If the instance has another number of agents than the environment; `batch` is then as it was.
+    """
+    shape = (config.height, config.width) if instance is None else instance.grid.shape
+    fitting = batch.on_maps_of(config, shape)
+    fitting.reset(seed, instances=None if instance is None else [instance], out=out)
+    return fitting
+
+
 def instance_asked_for(options: dict[str, Any] | None) -> Instance | None:
     """`options["instance"]` of a reset, if it is there; raises TypeError where it, or `options`, is something else."""
     instance = None if options is None else arguments.instance_of(options, dict, "options").get("instance")
@@ -287,7 +288,7 @@ def _space_of(agent: str, found: dict[str, spaces.Space[Any]]) -> spaces.Space[A
 
 
 def _as_preferences(agent: str, action: Any) -> npt.NDArray[np.float32]:
-    values = arguments.array(action, f"the action of {agent}")
+    values = arguments.numbers(action, f"the action of {agent}")
     if values.shape != (5,):
         raise ValueError(f"the action of {agent} must be a value for each of the five moves, got {action!r}")
     return rules.as_values(values)

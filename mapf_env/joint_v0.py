@@ -12,23 +12,28 @@ from gymnasium import spaces
 from mapf_env import arguments
 from mapf_env.batched_env import BatchedEnv, Observation
 from mapf_env.config import EnvConfig
-from mapf_env.grid_v0 import fov_space, instance_asked_for
+from mapf_env.grid_v0 import begun, fov_space, instance_asked_for
+from mapf_env.pixels import RENDER_MODES, RenderMode, Screen
 
 
 class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
     """All robots decided by one agent: it observes `{"fov": (N, C, F, F), "graph": (N, N)}` and acts by N moves.
 
-    The reward is the sum of the robots'. Infos carry `action_mask` (N, 5), `replaced` (N,) and `on_goal` (N,).
+    The reward is the sum of the robots' rewards. Infos carry `action_mask` (N, 5), `replaced` (N,) and `on_goal` (N,),
+    in lifelong tasks `arrived` (N,) too.
 
     Args:
+        render_mode: As in `GridEnv`.
         settings: Fields of `mapf_env.EnvConfig`.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012
 
-    def __init__(self, **settings: Any) -> None:
-        config = EnvConfig(**settings)  # which has none of the options of a batch alone
+    def __init__(self, *, render_mode: RenderMode | None = None, **settings: Any) -> None:
+        self.config = config = EnvConfig(**settings)  # which has none of the options of a batch alone
         self._batch = BatchedEnv(1, **settings)
+        self.render_mode = render_mode
+        self._screen = Screen(render_mode, self.metadata["render_fps"])
         N, view = config.num_agents, fov_space(config)
         low, high = (np.broadcast_to(bound, (N, *view.shape)) for bound in (view.low, view.high))
         self.observation_space = spaces.Dict(
@@ -42,16 +47,20 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Begin an episode: a fresh random instance, or `options["instance"]`; seeds are those of `BatchedEnv`.
+        """Begin an episode as `GridEnv` does: a fresh random instance, or `options["instance"]` with a map of any size.
 
         Raises:
-            ValueError: If the instance does not fit the environment.
-            TypeError: If the seed is no integer, `options` no dictionary or `options["instance"]` no `Instance`.
+            ValueError: If the instance has another number of agents than the environment.
+            TypeError: If the seed is not an integer, `options` not a dictionary or `options["instance"]` not an
+                `Instance`.
         """
         seed, instance = None if seed is None else arguments.seed(seed), instance_asked_for(options)
         super().reset(seed=seed)
-        observation = self._batch.reset(seed, instances=None if instance is None else [instance])
-        return self._seen(observation), self._infos(np.zeros(self._batch.num_agents, np.bool_))
+        observation = self._batch.buffers()
+        self._batch = begun(self._batch, self.config, seed, instance, observation)
+        self._show()
+        nobody = np.zeros(self._batch.num_agents, np.bool_)
+        return self._seen(observation), self._infos(nobody, nobody)
 
     def step(
         self, action: npt.NDArray[np.integer]
@@ -62,22 +71,37 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
             ValueError: If the shape is wrong or an action is out of range.
             TypeError: If the actions are not integers.
         """
-        step = self._batch.step(arguments.shaped(action, "action", "(N,)")[None])
+        joint = arguments.shaped(arguments.numbers(action, "action"), "action", "(N,)")
+        step = self._batch.step(joint[None])
         reward, terminated, truncated = step.rewards[0].sum(), step.terminated[0], step.truncated[0]
-        infos = self._infos(step.replaced[0])
+        infos = self._infos(step.replaced[0], step.arrived[0])
+        self._show()
         return self._seen(step.observation), float(reward), bool(terminated), bool(truncated), infos
+
+    def render(self) -> str | npt.NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The current state as `render_mode` has it; None without one and for "human".
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._screen.show(self._batch)
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
 
     def _seen(self, observation: Observation) -> dict[str, npt.NDArray[Any]]:
         return {"fov": observation.fov[0], "graph": observation.graph[0]}
 
-    def _infos(self, replaced: npt.NDArray[np.bool_]) -> dict[str, Any]:
-        return {
+    def _infos(self, replaced: npt.NDArray[np.bool_], arrived: npt.NDArray[np.bool_]) -> dict[str, Any]:
+        infos = {
             "action_mask": self._batch.action_mask()[0],
             "replaced": replaced,
             "on_goal": self._batch.on_goal()[0],
         }
+        return infos | {"arrived": arrived} if self.config.task == "lifelong" else infos
 
 
 def joint_env(**settings: Any) -> JointEnv:
-    """The team as one Gymnasium agent; the settings are the fields of `mapf_env.EnvConfig`."""
+    """The team as one Gymnasium agent; the settings are those of `JointEnv`."""
     return JointEnv(**settings)

@@ -1,15 +1,63 @@
-"""One state as text or as pixels, for PettingZoo's render modes."""
+"""One state as text or as pixels, for the render modes of PettingZoo and Gymnasium."""
 
 from __future__ import annotations
+
+import sys
+import time
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from mapf_env import svg
+from mapf_env import arguments, svg
+from mapf_env.batched_env import BatchedEnv
 from mapf_env.instance import Obstacles
 
+RenderMode = Literal["ansi", "rgb_array", "human"]
+RENDER_MODES: tuple[RenderMode, ...] = get_args(RenderMode)
 _CELL = 16
 _WALL, _FLOOR, _LINE = np.array([(59, 66, 82), (255, 255, 255), (232, 235, 239)], np.uint8)
+
+
+class Screen:
+    """Shows the first team of a batch in a render mode; without one nothing.
+
+    Args:
+        mode: "ansi" returns text, "rgb_array" a picture (H', W', 3), "human" prints the text. In a terminal each state
+            then replaces the one before.
+        fps: States that a terminal shows in a second.
+
+    Raises:
+        ValueError: If there is no such mode.
+    """
+
+    def __init__(self, mode: RenderMode | None, fps: float) -> None:
+        if mode is not None:
+            arguments.choice(mode, RENDER_MODES, "render_mode")
+        self._mode, self._fps, self._lines = mode, fps, 0
+
+    def show(self, batch: BatchedEnv) -> str | npt.NDArray[np.uint8] | None:
+        """Return or print the current state.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        if self._mode is None:
+            return None
+        if not batch.began:
+            raise RuntimeError("there is nothing to render before the first reset: call reset()")
+        state = batch.grids[0], batch.positions[0], batch.goals[0]
+        if self._mode == "rgb_array":
+            return picture(*state)
+        shown = text(*state)
+        if self._mode == "ansi":
+            return shown
+        if sys.stdout.isatty() and self._lines:
+            time.sleep(1 / self._fps)
+            print(f"\x1b[{self._lines}F\x1b[J", end="")  # up to the first line of the picture before, and clear
+        print(shown, flush=True)
+        self._lines = shown.count("\n") + 1
+        return None
 
 
 def text(grid: Obstacles, positions: npt.NDArray[np.integer], goals: npt.NDArray[np.integer]) -> str:

@@ -21,7 +21,7 @@ class Rewards:
     off_goal: float = 0.0
     """It is not."""
     arrival: float = 0.0
-    """It has come to its goal in this step."""
+    """It has moved onto its goal in this step."""
     replaced: float = 0.0
     """The shield replaced its action."""
     solved: float = 0.0

@@ -212,7 +212,7 @@ def pibt_shield(
     equal ones in an order drawn by the seed; a robot in the way of a more important one moves aside if it can.
     Source: Okumura, Machida, Defago and Tamura 2022.
     """
-    array = np.asarray(wanted)
+    array = arguments.numbers(wanted, "wanted")
     if array.ndim == 3:
         values, actions = as_values(array), np.zeros((0, 0), np.int64)
     else:
@@ -225,24 +225,24 @@ def draw_goals(
     fov_radius: int,
     positions: npt.ArrayLike,
     goals: npt.ArrayLike,
-    arrived: npt.NDArray[np.bool_],
+    on_goal: npt.NDArray[np.bool_],
     arrivals: npt.NDArray[np.int32],
     seeds: npt.NDArray[np.uint64],
 ) -> Positions:
-    """Goals (B, N, 2) in which the robots that have `arrived` (B, N) have new ones.
+    """Goals (B, N, 2) in which the robots that are `on_goal` (B, N) have new ones.
 
     A new goal is uniform over the free cells that the robot can reach, that are no robot's goal and where it does not
     stand; if there is none, it keeps its goal. The draw depends on the environment's seed, the robot and the number of
     its `arrivals` (B, N).
     """
     drawn = _cells(goals, "goals")
-    _native.draw_goals(obstacles, fov_radius, _cells(positions), drawn, arrivals, arrived, seeds)
+    _native.draw_goals(obstacles, fov_radius, _cells(positions), drawn, arrivals, on_goal, seeds)
     return drawn
 
 
 def as_values(values: npt.ArrayLike) -> npt.NDArray[np.float32]:
     """`values` of all five actions as contiguous float32; raises TypeError if they are not numbers."""
-    array = np.asarray(values)
+    array = arguments.numbers(values, "values of actions")
     if array.dtype.kind not in "fiu":
         raise TypeError(f"values of actions must be numbers, got dtype {array.dtype}")
     return np.ascontiguousarray(array, dtype=np.float32)
@@ -250,9 +250,11 @@ def as_values(values: npt.ArrayLike) -> npt.NDArray[np.float32]:
 
 def as_actions(actions: npt.ArrayLike) -> npt.NDArray[np.int64]:
     """`actions` as int64; raises TypeError if they are not integers."""
-    array = np.asarray(actions)
+    array = arguments.numbers(actions, "actions")
     if array.dtype.kind not in "iu":
         raise TypeError(f"actions must be integers 0..4 (up, left, down, right, idle), got dtype {array.dtype}")
+    if array.dtype == np.uint64:
+        array = np.minimum(array, np.uint64(np.iinfo(_ACTION).max))
     return array if array.dtype == _ACTION else array.astype(_ACTION)
 
 

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "mapf_env/native/checks.hpp"
@@ -44,7 +45,8 @@ inline nanobind::dict rows_by_agent(nanobind::list agents, nanobind::tuple names
     return rows;
 }
 
-// Reads actions[agent] of each agent, in order; false if the agents are not the same or an action is no whole number.
+// Reads actions[agent] of each agent, in order. Returns false if the agents differ, or where an action is neither an int
+// nor a NumPy integer: the caller in Python then reads it by the rule of all interfaces, or says what is wrong with it.
 inline bool read_actions(const nanobind::dict& actions, const nanobind::list& agents,
                          std::vector<std::int64_t>& wanted) {
     const std::size_t count = wanted.size();
@@ -52,8 +54,10 @@ inline bool read_actions(const nanobind::dict& actions, const nanobind::list& ag
     for (std::size_t i = 0; i < count; ++i) {
         PyObject* action = PyDict_GetItem(actions.ptr(), PyList_GetItem(agents.ptr(), static_cast<Py_ssize_t>(i)));
         if (action == nullptr) return false;
-        const nanobind::object whole =
-            PyLong_Check(action) ? nanobind::borrow(action) : nanobind::steal(PyNumber_Index(action));
+        if (PyBool_Check(action)) return false;
+        const bool is_int = PyLong_Check(action);
+        if (!is_int && std::strncmp(Py_TYPE(action)->tp_name, "numpy.", 6) != 0) return false;
+        const nanobind::object whole = is_int ? nanobind::borrow(action) : nanobind::steal(PyNumber_Index(action));
         wanted[i] = whole.is_valid() ? PyLong_AsLongLong(whole.ptr()) : -1;
         if (wanted[i] == -1 && PyErr_Occurred()) {
             PyErr_Clear();

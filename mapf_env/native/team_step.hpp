@@ -203,23 +203,23 @@ void write_action_mask(const Teams<T>& teams, std::size_t b) {
     }
 }
 
-// A new goal for each robot of team b that has arrived in this step.
+// A new goal for each robot of team b that is on its goal; without an arrival if it began there or found no other goal.
 template <class T>
 void give_goals(const Teams<T>& teams, std::size_t b, TeamScratch<T>& scratch) {
     const auto& layout = teams.layout;
     const std::size_t first = b * teams.num_agents;
     const int n = teams.team_sizes[b];
-    const bool* arrived = teams.arrived + first;
-    if (std::none_of(arrived, arrived + n, [](bool robot) { return robot; })) return;
+    bool* on_goal = teams.on_goal + first;
+    if (std::none_of(on_goal, on_goal + n, [](bool robot) { return robot; })) return;
     std::int32_t* goals = teams.goals + 2 * first;
     mark(layout, goals, n, std::uint8_t{1}, scratch.taken.data());
     for (int i = 0; i < n; ++i) {
-        if (!arrived[i]) continue;
+        if (!on_goal[i]) continue;
         const bool is_new = draw_goal(layout, teams.regions + b * layout.size(), teams.positions + 2 * (first + i),
                                       goal_random(teams.seeds[b], i, teams.arrivals[first + i]), scratch.taken.data(),
                                       goals + 2 * i);
         if (!is_new) continue;
-        teams.on_goal[first + i] = false;
+        on_goal[i] = false;
         if (teams.distances == nullptr) continue;
         distances_to(grid_of(layout, teams.obstacles + b * layout.size()), layout.cell(goals[2 * i], goals[2 * i + 1]),
                      scratch.distance, scratch.queue);
@@ -273,7 +273,7 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
         const int row = positions[2 * i], col = positions[2 * i + 1];
         const int goal_row = goals[2 * i], goal_col = goals[2 * i + 1];
         const int new_row = row + row_step[executed[i]], new_col = col + col_step[executed[i]];
-        const bool was_there = (row == goal_row) & (col == goal_col) & !options.lifelong;
+        const bool was_there = (row == goal_row) & (col == goal_col);
         const bool is_there = (new_row == goal_row) & (new_col == goal_col);
         const bool arrives = is_there & !was_there;
         positions[2 * i] = new_row;

@@ -1,6 +1,7 @@
 """Laws of the PettingZoo view's own arguments: forms of observation, preferences, reused buffers, state, rendering."""
 
 import copy
+import pickle
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from pettingzoo.test import parallel_api_test, render_test, state_test
 
 import mapf_env
-from mapf_env import parallel_env, parse_instance
+from mapf_env import parallel_env, parse_instance, random_instance
 
 SMALL: dict[str, Any] = {"num_agents": 4, "height": 6, "width": 6, "max_cycles": 15}
 
@@ -40,6 +41,8 @@ def test_pettingzoos_render_and_state_tests() -> None:
 def same(one: Any, other: Any) -> bool:
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
     return np.array_equal(one, other)
 
 
@@ -128,3 +131,82 @@ def test_in_a_terminal_each_state_takes_the_place_of_the_one_before(
     env.step({"agent_0": 4, "agent_1": 2})
     assert capsys.readouterr().out == "AB#\n.ba\n\x1b[2F\x1b[JA.#\n.*a\n"
     assert waits == [0.25]
+
+
+FOUR: dict[str, Any] = {"num_agents": 4, "fov_radius": 2, "extra_channels": ("cost_to_go",), "reward": "shaped"}
+
+
+@pytest.mark.parametrize("settings", [{}, {"reuse_buffers": True}, {"task": "lifelong", "comm_range": "connected"}])
+@pytest.mark.parametrize(("height", "width"), [(4, 9), (30, 25), (6, 5), (2, 2)])
+def test_a_given_instance_may_have_a_map_of_any_size(height: int, width: int, settings: dict[str, Any]) -> None:
+    """It is played as by an environment of its own size, and afterwards the stream of random ones goes on."""
+    instance = random_instance(num_agents=4, height=height, width=width, density=0.0, seed=1)
+    sized = parallel_env(**FOUR, **settings, height=height, width=width, density=0.0)
+    env, plain = (
+        parallel_env(**FOUR, **settings, height=6, width=6),
+        parallel_env(**FOUR, **settings, height=6, width=6),
+    )
+    spaces = copy.deepcopy(env.observation_spaces)
+    for each in (env, plain):
+        each.reset(seed=5)
+        each.step(dict.fromkeys(each.agents, 4))
+    for seed in (7, None):
+        assert same(
+            env.reset(seed=seed, options={"instance": instance}), sized.reset(seed=seed, options={"instance": instance})
+        )
+        assert env.instance() == instance
+        assert (env.grid == instance.grid).all()
+        for action in (0, 1, 2, 3, 4):
+            if not env.agents:
+                break
+            joint = dict.fromkeys(env.agents, action)
+            outcome = env.step(joint)
+            assert same(outcome, sized.step(joint))
+            assert all(env.observation_spaces[agent].contains(seen) for agent, seen in outcome[0].items())
+        assert env.render() is None
+    assert env.observation_spaces == spaces
+    if (height, width) != (6, 6):
+        with pytest.raises(ValueError, match=rf"maps, 6x6, but this .* one of {height}x{width}: .* height={height}"):
+            env.state()
+    plain.reset(seed=7)
+    plain.reset()
+    for each in (env, plain):
+        each.reset()
+    assert env.state().shape == env.state_space.shape
+    assert env.instance() == plain.instance()
+
+
+def test_copies_made_on_a_map_of_another_size_go_on_identically() -> None:
+    env = parallel_env(num_agents=2, height=4, width=4)
+    env.reset(seed=1, options={"instance": random_instance(num_agents=2, height=7, width=3, density=0.0, seed=0)})
+    twin = pickle.loads(pickle.dumps(copy.deepcopy(env)))
+    joint = dict.fromkeys(env.agents, 2)
+    assert same(env.step(joint), twin.step(joint))
+    assert same(env.reset(), twin.reset())
+    assert env.instance() == twin.instance()
+
+
+def test_a_map_of_another_size_is_played_in_turns_and_as_one_agent_too() -> None:
+    instance = parse_instance("A#\na#")
+    in_turns = mapf_env.env(num_agents=1)
+    in_turns.reset(options={"instance": instance})
+    in_turns.step(2)
+    assert in_turns.terminations == {"agent_0": True}
+    env = mapf_env.joint_env(num_agents=1, render_mode="ansi")
+    seen, _ = env.reset(options={"instance": instance})
+    assert env.observation_space.contains(seen)
+    assert env.render() == "A#\na#"
+    assert env.step(np.array([2]))[2]
+    env.reset(seed=3)
+    assert str(env.render()).count("\n") == 19
+
+
+def test_a_refused_instance_leaves_the_episode_as_it_was() -> None:
+    for env in (parallel_env(num_agents=2), mapf_env.joint_env(num_agents=2)):
+        env.reset(seed=0)
+        before = env._batch.positions
+        with pytest.raises(ValueError, match="the instance has 3 agents, the environment 2"):
+            env.reset(options={"instance": random_instance(num_agents=3, height=9, width=9)})
+        assert (env._batch.positions == before).all()
+    with pytest.raises(ValueError, match="the instance's map is 9x9, the environment's 20x20"):
+        mapf_env.BatchedEnv(1, num_agents=3).reset(instances=[random_instance(num_agents=3, height=9, width=9)])

@@ -69,7 +69,7 @@ def test_the_fused_step_is_the_rules_one_after_another(
         assert (step.replaced == (executed != wanted)).all()
         on_goal, was_on_goal = (after == goals).all(-1), (before == goals).all(-1)
         lifelong = config.task == "lifelong"
-        arrived = on_goal if lifelong else on_goal & ~was_on_goal
+        arrived = on_goal & ~was_on_goal
         assert (step.arrived == arrived).all()
         arrivals += arrived
         under_way = np.where(on_goal, 0, under_way + 1).astype(np.int32)
@@ -87,7 +87,7 @@ def test_the_fused_step_is_the_rules_one_after_another(
         assert np.allclose(step.rewards, expected_rewards)
         if lifelong:
             assert (
-                env.goals == rules.draw_goals(maps, config.fov_radius, after, goals, arrived, arrivals, seeds)
+                env.goals == rules.draw_goals(maps, config.fov_radius, after, goals, on_goal, arrivals, seeds)
             ).all()
         else:
             assert (env.goals == goals).all()
@@ -366,8 +366,53 @@ def test_a_lifelong_robot_without_a_free_cell_keeps_its_goal() -> None:
     full = Instance(np.zeros((1, 2), bool), [[0, 0], [0, 1]], [[0, 1], [0, 0]])
     env = BatchedEnv(1, num_agents=2, height=1, width=2, density=0.0, task="lifelong")
     env.reset(instances=[full.at(full.goals)])
-    assert env.step([[4, 4]]).arrived.all()
+    assert not env.step([[4, 4]]).arrived.any()
     assert (env.goals[0] == full.goals).all()
+
+
+@pytest.mark.parametrize("shield", ["idle", "pibt"])
+@pytest.mark.parametrize("task", ["one_shot", "lifelong"])
+def test_a_robot_that_does_not_move_does_not_arrive(task: str, shield: str) -> None:
+    """A full map, where no robot can get a new goal, idle, blocked by each other and by walls."""
+    cells = [(0, 0), (0, 1), (1, 0), (1, 1)]
+    full = Instance(np.zeros((2, 2), bool), cells, cells)
+    settings: dict[str, Any] = {"num_agents": 4, "height": 2, "width": 2, "density": 0.0, "shield": shield}
+    env, returned = BatchedEnv(1, task=task, reward="arrival", **settings), np.zeros(4)
+    for actions in ([4, 4, 4, 4], [0, 0, 1, 3], [3, 1, 4, 4]):
+        for _ in range(10):
+            env.reset(seed=0, instances=[full])
+            step = env.step([actions])
+            returned += step.rewards[0]
+            moved = (env.positions[0] != full.starts).any(axis=1)
+            assert not (step.arrived[0] & ~moved).any()
+    if shield == "idle":
+        assert returned.tolist() == [0, 0, 0, 0]
+
+
+def test_a_lifelong_robot_that_begins_on_its_goal_gets_a_new_one_without_an_arrival() -> None:
+    instance = Instance(np.zeros((1, 5), bool), [[0, 0], [0, 4]], [[0, 0], [0, 3]])
+    env = BatchedEnv(1, num_agents=2, height=1, width=5, density=0.0, task="lifelong", reward="arrival")
+    env.reset(seed=0, instances=[instance])
+    step = env.step([[4, 4]])
+    assert not step.arrived.any()
+    assert not step.rewards.any()
+    assert env.goals[0, 0].tolist() in ([0, 1], [0, 2], [0, 4])
+    assert env.goals[0, 1].tolist() == [0, 3]
+    assert not env.on_goal().any()
+
+
+@given(strategies.all_settings(), strategies.seeds)
+@hypothesis_settings(max_examples=50)
+def test_arrivals_are_moves_onto_goals(settings: dict[str, Any], seed: int) -> None:
+    env, generator = BatchedEnv(3, **settings), np.random.default_rng(seed)
+    env.reset(seed)
+    for _ in range(env.config.max_cycles):
+        before, goals = env.positions, env.goals
+        step = env.step(generator.integers(0, 5, (3, env.num_agents)))
+        moved = (env.positions != before).any(-1)
+        assert (step.arrived == (moved & (env.positions == goals).all(-1))).all()
+        if (step.terminated | step.truncated).any():
+            return
 
 
 def test_reward_schemes() -> None:
