@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 import experts
-from gnn_policy.command_line import mistakes_in_one_line
+from gnn_policy.command_line import run_command
 from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.dagger import Teacher
 from gnn_policy.evaluation import Estimate, Exam
@@ -95,6 +95,8 @@ class Options:
     """Names of variants to train now; the table has all that are finished."""
     updates: int = BASE.updates_per_epoch or 0
     """Gradient steps in each of the 12 rounds."""
+    debug: bool = False
+    """Print the traceback of an error."""
 
 
 def main(options: Options) -> None:
@@ -313,5 +315,4 @@ def draw(found: dict[tuple[str, int], dict[str, Any]], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    with mistakes_in_one_line():
-        main(tyro.cli(Options, description=__doc__))
+    run_command(lambda arguments: tyro.cli(Options, args=arguments, description=__doc__), main)

@@ -26,15 +26,16 @@ from rich.console import Console
 from rich.progress import Progress
 
 from gnn_policy import checkpoint, evaluation
-from gnn_policy.command_line import mistakes_in_one_line
+from gnn_policy.command_line import run_command
 from gnn_policy.config import RECIPES
-from gnn_policy.examination import refuse_other_settings
 from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast, resolved
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.results_file import refuse_other_settings
 from gnn_policy.rollout import rollout
-from gnn_policy.training import RunLockedError, Training, split_cases
+from gnn_policy.run_folder import RunLockedError
+from gnn_policy.training import Training, split_cases
 from mapf_env.files import write_whole
 from paper_experiment import Experiment, Model, Options, Scene, W
 from paper_figures import draw
@@ -212,18 +213,17 @@ def _seconds(action: Callable[[], object], times: int = 20) -> float:
 
 def main(options: Options) -> None:
     """Do the chosen part."""
-    with mistakes_in_one_line():
-        experiment, console = Experiment(options), Console()
-        if options.step in ("all", "plan"):
-            plan(experiment, console)
-        if options.step in ("all", "train"):
-            train(experiment, console)
-        if options.step in ("all", "test"):
-            test(experiment, console)
-        if options.step in ("all", "draw"):
-            for path in draw(experiment):
-                console.print(path, highlight=False)
+    experiment, console = Experiment(options), Console()
+    if options.step in ("all", "plan"):
+        plan(experiment, console)
+    if options.step in ("all", "train"):
+        train(experiment, console)
+    if options.step in ("all", "test"):
+        test(experiment, console)
+    if options.step in ("all", "draw"):
+        for path in draw(experiment):
+            console.print(path, highlight=False)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    run_command(lambda arguments: tyro.cli(Options, args=arguments, description=__doc__), main)

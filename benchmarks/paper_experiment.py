@@ -12,8 +12,8 @@ import tyro
 
 from gnn_policy import checkpoint
 from gnn_policy.checkpoint import WEIGHTS
-from gnn_policy.command_line import cpu_threads
 from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
 from gnn_policy.precision import Precision
 from mapf_env.generation import MapStyle
@@ -81,6 +81,8 @@ class Options:
     """In which numbers the policies compute in the tests, as in gnn_policy.train."""
     threads: int = 1
     """CPU threads of training, testing and the expert; 0 takes all that the process may use."""
+    debug: bool = False
+    """Print the traceback of an error."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gnn_policy.command_line import mistakes_in_one_line
+from gnn_policy.command_line import run_command
 from gnn_policy.failures import MEANINGS
 from mapf_env.files import write_whole
 from paper_experiment import PAPER, TEAMS
@@ -52,6 +52,8 @@ class Options:
     """What benchmarks/speed.py, solvers.py or training.py printed, as text files."""
     out: Path = Path("report.html")
     """The page."""
+    debug: bool = False
+    """Print the traceback of an error."""
 
 
 @dataclass(frozen=True)
@@ -251,16 +253,24 @@ def side_by_side(*diagrams: Axes) -> str:
     return f"<section>{''.join(pictures)}</section>"
 
 
+def parse(arguments: Sequence[str]) -> Options:
+    """The command that the arguments ask for."""
+    return tyro.cli(Options, args=arguments, prog="python benchmarks/report.py", description=__doc__)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
-    with mistakes_in_one_line():
-        options = tyro.cli(Options, args=arguments, prog="python benchmarks/report.py", description=__doc__)
-        if not options.runs:
-            raise ValueError("give at least one run folder of gnn_policy.train")
-        runs = [Run.load(folder) for folder in options.runs]
-        speed = {file.name: file.read_text(encoding="utf-8") for file in options.speed}
-        write_whole(options.out, page(runs, speed))
-        print(f"report: {options.out}")
+    run_command(parse, write_report, arguments)
+
+
+def write_report(options: Options) -> None:
+    """Write the page."""
+    if not options.runs:
+        raise ValueError("give at least one run folder of gnn_policy.train")
+    runs = [Run.load(folder) for folder in options.runs]
+    speed = {file.name: file.read_text(encoding="utf-8") for file in options.speed}
+    write_whole(options.out, page(runs, speed))
+    print(f"report: {options.out}")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
     python benchmarks/training.py round       the parts of a round, one thread
     python benchmarks/training.py steps       gradient steps with each encoder, convolution and precision, one thread
     python benchmarks/training.py processes   gradient steps with threads, and with processes under torchrun
+    python benchmarks/training.py company     rounds next to no, one and two busy processes, and on one thread
 
 "Overhead" is all of a round that is neither the network nor the expert nor the environment: batches rebuilt from
 positions, TorchRL's collector and loss module, our own loops. The network's parts are timed by themselves before and
@@ -12,12 +13,14 @@ after the rounds, on batches like theirs. Nothing else may run on the machine me
 from __future__ import annotations
 
 import csv
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -201,10 +204,54 @@ def threads_and_processes() -> None:
             print(f"{processes} processes, {threads} threads each: {rate:,.0f} robot states a second", flush=True)
 
 
-TABLES = {"round": parts_of_a_round, "steps": speed_of_steps, "processes": threads_and_processes}
+def seconds_of_a_round(run: Path, *options: str) -> float:
+    """Median time of the rounds after the first in a short training with the quick recipe's batches."""
+    settings = """
+        --epochs 5 --updates-per-epoch 200 --train-maps 200 --validation-maps 1 --validation-cases-per-map 1
+        --test-maps 1 --cases-per-map 1 --demonstration-steps 8192 --dagger-steps 8192 --validate-every 5
+    """
+    command = [sys.executable, "-m", "gnn_policy.train", "--run", str(run), *settings.split(), *options]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    with (run / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))[1:]
+    return float(np.median([float(row["collect_seconds"]) + float(row["fit_seconds"]) for row in rows]))
 
 
-def main(table: tyro.conf.Positional[Literal["round", "steps", "processes"]], /) -> None:
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Run `count` processes that compute all the time, one thread each."""
+    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def company() -> None:
+    """A line for each number of busy processes next to training, and one for training on one thread."""
+    with tempfile.TemporaryDirectory() as folder:
+        rest = math.nan
+        for busy, options in ((0, ()), (1, ()), (2, ()), (0, ("--threads", "1"))):
+            with busy_processes(busy):
+                seconds = seconds_of_a_round(Path(folder, f"{busy}{''.join(options)}"), *options)
+            rest = seconds if math.isnan(rest) else rest
+            how = f"{busy} busy processes, {'one thread' if options else 'default threads'}"
+            print(f"{how:34} {seconds:6.2f} s a round  {seconds / rest:5.2f} x", flush=True)
+
+
+TABLES = {
+    "round": parts_of_a_round,
+    "steps": speed_of_steps,
+    "processes": threads_and_processes,
+    "company": company,
+}
+
+
+def main(table: tyro.conf.Positional[Literal["round", "steps", "processes", "company"]], /) -> None:
     """Print one of the tables."""
     TABLES[table]()
 

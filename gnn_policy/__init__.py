@@ -1,19 +1,48 @@
 """The pupil: a CNN-GNN policy that imitates an expert, its training loop and its evaluation."""
 
+import os
+import sys
+from importlib import import_module
 from importlib.util import find_spec
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-# Looked for, not imported: to play a policy takes no TorchRL, whose import takes as long as all else.
+# Found, not imported: the commands read their arguments before they load a library that takes seconds.
 if missing := [name for name in ("torch", "torchrl") if find_spec(name) is None]:
     raise ImportError(
         f'gnn_policy needs the extra "train" (there is no {missing[0]}): '
         'pip install "mapf-env[train]", or in a checkout pip install ".[train]"'
     )
 
-from gnn_policy.checkpoint import load, save
-from gnn_policy.execution import Execution
-from gnn_policy.network import DecentralizedPolicy, GraphFilter, PolicyConfig, shift_operator
-from gnn_policy.robot import Message, Robot
-from gnn_policy.rollout import Actor, Rollouts, Teams, rollout
+# OpenMP's threads wait for each other by spinning, which multiplies the time of training as soon as another process
+# takes a part of a core. The library reads this once, when torch loads it.
+if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & os.environ.keys():
+    os.environ["GOMP_SPINCOUNT"] = "1000"
+
+if TYPE_CHECKING:
+    from gnn_policy.checkpoint import load, save
+    from gnn_policy.execution import Execution
+    from gnn_policy.network import DecentralizedPolicy, GraphFilter, shift_operator
+    from gnn_policy.policy_config import PolicyConfig
+    from gnn_policy.robot import Message, Robot
+    from gnn_policy.rollout import Actor, Rollouts, Teams, rollout
+
+_MODULES = {
+    "Actor": "rollout",
+    "DecentralizedPolicy": "network",
+    "Execution": "execution",
+    "GraphFilter": "network",
+    "Message": "robot",
+    "PolicyConfig": "policy_config",
+    "Robot": "robot",
+    "Rollouts": "rollout",
+    "Teams": "rollout",
+    "load": "checkpoint",
+    "rollout": "rollout",
+    "save": "checkpoint",
+    "shift_operator": "network",
+}
+"""Each public name and the module that defines it, which is imported when the name is first used."""
 
 __all__ = [
     "Actor",
@@ -30,3 +59,23 @@ __all__ = [
     "save",
     "shift_operator",
 ]
+
+
+class _Package(ModuleType):
+    """This package, whose `rollout` is the function even once the module of that name is imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value.rollout if name == "rollout" and isinstance(value, ModuleType) else value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,99 +1,197 @@
-"""Policies on disk: one safetensors file that carries its own configuration."""
+"""Policies on disk: one safetensors file that carries its own configuration. torch is loaded with the weights only."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Collection
+from dataclasses import asdict, replace
 from hashlib import blake2b
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import safetensors
-import safetensors.torch
-import torch
 
 from gnn_policy.config import TrainConfig
-from gnn_policy.network import DecentralizedPolicy, PolicyConfig
+from gnn_policy.policy_config import PolicyConfig
 from mapf_env.files import PathLike, replacing
+
+if TYPE_CHECKING:
+    import torch
+
+    from gnn_policy.network import DecentralizedPolicy
 
 FORMAT = "mapf-env policy 1"
 DUST = 1e-15
-"""No weight that a policy is saved with is smaller, but for zero."""
+"""Saved weights smaller than this are set to zero."""
 WEIGHTS = Path(__file__).with_name("weights")
 """The policies that come with the package, and their card, README.md."""
 PACKAGED = WEIGHTS / "n12.safetensors"
-"""The one that is taken where none is given."""
+"""The default policy."""
 
 
 class CheckpointError(ValueError):
-    """A file that is no policy of this package; the message says which and why."""
+    """A file that is not a policy of this package; the message says which and why."""
 
 
 def save(policy: DecentralizedPolicy, path: PathLike, **about: str) -> None:
     """Write the weights and the configuration of `policy` to one file, replacing it as a whole or not at all.
 
+    Equal weights, configuration and notes give equal bytes.
+
     Args:
         policy: The policy.
         path: A file, by convention ending in `.safetensors`.
-        about: Notes that travel with the weights, as the command that trained them.
+        about: Notes that travel with the weights, such as the command that trained them.
 
     Raises:
         TypeError: If it is another network, which `load` could not build.
+        ValueError: If a weight is not a finite number.
     """
+    import safetensors.torch
+
+    from gnn_policy.finite import require_finite
+    from gnn_policy.network import DecentralizedPolicy
+
     if not isinstance(policy, DecentralizedPolicy):
         raise TypeError(
             f"save writes a DecentralizedPolicy, got {type(policy).__name__}: give its state_dict to torch.save"
         )
+    require_finite(policy.state_dict())
     metadata = {**about, "format": FORMAT, "policy": json.dumps(asdict(policy.config))}
     weights = {name: _without_dust(tensor).contiguous() for name, tensor in policy.state_dict().items()}
     with replacing(path) as draft:
-        draft.write_bytes(safetensors.torch.save(weights, metadata))
+        draft.write_bytes(_with_sorted_metadata(safetensors.torch.save(weights, metadata)))
+
+
+def _with_sorted_metadata(content: bytes) -> bytes:
+    """The same safetensors file with its metadata in alphabetical order; the library's order is random."""
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + content[8 + length :]
 
 
 def _without_dust(tensor: torch.Tensor) -> torch.Tensor:
-    """Zero for what is too small to show in any sum.
+    """Replace weights that are too small to show in any sum by zero.
 
     Weight decay brings the weights of units that are never active down to denormal numbers, with which a CPU computes
     several times slower.
     """
+    import torch
+
     return torch.where(tensor.abs() < DUST, 0, tensor) if tensor.is_floating_point() else tensor
 
 
-def load(path: PathLike = PACKAGED) -> DecentralizedPolicy:
-    """A policy in evaluation mode.
-
-    A policy that has an encoder or a graph layer of your own imports the module that its configuration names.
+def load(path: PathLike = PACKAGED, *, plugins: Collection[str] = ()) -> DecentralizedPolicy:
+    """Return a policy in evaluation mode.
 
     Args:
         path: A file, a run folder of `gnn_policy.train`, or the name of a policy that comes with the package: by the
             robots of its training teams "n4", "n6", "n8", "n10", "n12", or "n12-informed", which sees the cost to go.
+        plugins: The encoders and graph layers of your own, as "module:Class", that the file may import. Their modules
+            run as your code: name only those that you trust.
 
     Raises:
-        FileNotFoundError: If there is none.
-        CheckpointError: If the file is damaged, of another program or of another architecture.
+        FileNotFoundError: If there is no such file.
+        CheckpointError: If the file is damaged, comes from another program, does not fit its configuration, has weights
+            that are not finite, or wants a part that `plugins` does not name.
+        TypeError: If `plugins` is one name and not a collection of names.
     """
-    metadata, weights = _read(path)
+    import safetensors.torch
+
+    from gnn_policy.finite import require_finite
+    from gnn_policy.network import DecentralizedPolicy
+
+    if isinstance(plugins, str):
+        raise TypeError(f"plugins must be a collection of names, got {plugins!r}: write ({plugins!r},)")
+    file, (metadata, shapes) = file_of(path), _read_header(path)
     try:
-        policy = DecentralizedPolicy(PolicyConfig(**json.loads(metadata["policy"])))
-        policy.load_state_dict(weights)
+        config = PolicyConfig(**_json_object(metadata["policy"]))
+    except (KeyError, TypeError, ValueError, RecursionError) as wrong:
+        raise _misfit(file, wrong) from wrong
+    for setting, name in config.plugins.items():
+        if name not in plugins:
+            raise CheckpointError(
+                f"{file} wants to import its {setting} {name!r} from the module {name.partition(':')[0]!r}: if you "
+                f'trust that module, ask for it by plugins=("{name}",), or by --plugins {name} on the command line'
+            )
+    try:
+        _require_shapes(config, shapes)
+        policy = DecentralizedPolicy(config)
+        policy.load_state_dict(safetensors.torch.load_file(file))
+        require_finite(policy.state_dict())
+    except safetensors.SafetensorError as damage:
+        raise _damaged(file, damage) from damage
     except (KeyError, TypeError, ValueError, RuntimeError) as mismatch:
-        why = " ".join(f"{type(mismatch).__name__}: {mismatch}".split())
-        raise CheckpointError(f"the weights in {file_of(path)} do not fit their configuration ({why})") from None
+        raise _misfit(file, mismatch) from mismatch
     return policy.eval()
 
 
+def _require_shapes(config: PolicyConfig, found: dict[str, tuple[int, ...]]) -> None:
+    """Compare the tensors of a file with its configuration before memory is allocated.
+
+    The user's own parts are left to `load_state_dict`.
+
+    Raises:
+        ValueError: If a tensor is missing or has another shape.
+    """
+    import torch
+
+    from gnn_policy.network import DecentralizedPolicy
+
+    own = tuple(f"{'encoder' if setting == 'encoder' else 'filter'}." for setting in config.plugins)
+    built_in = {"encoder": "lean", "graph_layer": "filter"}
+    known = replace(config, **{setting: built_in[setting] for setting in config.plugins})
+    with torch.device("meta"):
+        expected = DecentralizedPolicy(known).state_dict()
+    for name, tensor in expected.items():
+        if not name.startswith(own) and found.get(name) != tuple(tensor.shape):
+            raise ValueError(f"{name} should have shape {tuple(tensor.shape)}, the file has {found.get(name)}")
+    if strange := [name for name in found if name not in expected and not name.startswith(own)]:
+        raise ValueError(f"the file has the unknown tensor {strange[0]}")
+
+
 def about(path: PathLike) -> dict[str, str]:
-    """The notes that were saved with the policy at `path`; raises as `load` does."""
-    return _read(path)[0]
+    """Return the notes that were saved with the policy at `path`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        CheckpointError: If the file is damaged or comes from another program.
+    """
+    return _read_header(path)[0]
 
 
 def trained_with(path: PathLike) -> TrainConfig:
-    """The settings of its training as the policy at `path` tells them, else the defaults; raises as `load` does."""
+    """Return the settings that the policy at `path` was trained with, or the defaults if it does not say.
+
+    Settings of newer versions, which this one does not know, are left out.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        CheckpointError: If the file is damaged, or a setting has a wrong type or value.
+    """
     settings = about(path).get("training")
-    return TrainConfig() if settings is None else TrainConfig.from_json(settings)
+    if settings is None:
+        return TrainConfig()
+    try:
+        return TrainConfig.from_json(settings, ignore_unknown=True)
+    except ValueError as wrong:
+        raise CheckpointError(f"{file_of(path)}: the settings of its training are damaged: {wrong}") from wrong
+
+
+def trained_under(path: PathLike) -> str:
+    """Return the shield of the training of the policy at `path`, "idle" if it does not say; raises as `about` does."""
+    settings = about(path).get("training")
+    try:
+        return TrainConfig().shield if settings is None else _json_object(settings)["shield"]
+    except (KeyError, TypeError, ValueError, RecursionError) as wrong:
+        raise CheckpointError(f"{file_of(path)}: the settings of its training are damaged: {wrong}") from wrong
 
 
 def fingerprint(policy: DecentralizedPolicy) -> str:
-    """A hash of the configuration and the weights."""
+    """Return a hash of the configuration and the weights."""
     hashed = blake2b(json.dumps(asdict(policy.config)).encode(), digest_size=8)
     for name, tensor in policy.state_dict().items():
         hashed.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
@@ -101,7 +199,7 @@ def fingerprint(policy: DecentralizedPolicy) -> str:
 
 
 def file_of(path: PathLike) -> Path:
-    """The file that `load` reads for a path or name; it need not exist."""
+    """Return the file that `load` reads for a path or name; it need not exist."""
     given = Path(path)
     if given.is_dir():
         return given / "best.safetensors"
@@ -109,7 +207,8 @@ def file_of(path: PathLike) -> Path:
     return packaged if given.name == str(given) and not given.exists() and packaged.is_file() else given
 
 
-def _read(path: PathLike) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+def _read_header(path: PathLike) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
+    """The metadata of a policy and the shapes of its tensors, which the library has compared with the file's length."""
     file = file_of(path)
     if not file.is_file():
         names = ", ".join(sorted(each.stem for each in WEIGHTS.glob("*.safetensors")))
@@ -117,16 +216,30 @@ def _read(path: PathLike) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
             f"there is no checkpoint {file}: give a .safetensors file, a run folder of training, or one of {names}"
         )
     try:
-        with safetensors.safe_open(file, "pt") as stored:
+        with safetensors.safe_open(file, "np") as stored:
             metadata: dict[str, str] = stored.metadata() or {}
-        weights = safetensors.torch.load_file(file)
+            shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in stored.keys()}  # noqa: SIM118
     except safetensors.SafetensorError as damage:
-        raise CheckpointError(
-            f"{file} is damaged or no safetensors file ({damage}): restore or train it anew"
-        ) from None
+        raise _damaged(file, damage) from damage
     if metadata.get("format") != FORMAT:
         raise CheckpointError(
-            f"{file} is no policy of this package (format {metadata.get('format')!r}, expected {FORMAT!r}): "
+            f"{file} is not a policy of this package (format {metadata.get('format')!r}, expected {FORMAT!r}): "
             "give a file that gnn_policy.save wrote"
         )
-    return metadata, weights
+    return metadata, shapes
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    found = json.loads(text)
+    if not isinstance(found, dict):
+        raise TypeError(f"the settings are not an object but {type(found).__name__}")
+    return found
+
+
+def _misfit(file: Path, mismatch: Exception) -> CheckpointError:
+    why = " ".join(f"{type(mismatch).__name__}: {mismatch}".split())
+    return CheckpointError(f"the weights in {file} do not fit their configuration ({why})")
+
+
+def _damaged(file: Path, damage: Exception) -> CheckpointError:
+    return CheckpointError(f"{file} is damaged or not a safetensors file ({damage}): restore it or train again")

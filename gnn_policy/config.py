@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal
 
 from gnn_policy.cases import Split
 from gnn_policy.execution import Shield
-from gnn_policy.network import PolicyConfig
-from gnn_policy.precision import Precision
+from gnn_policy.policy_config import PolicyConfig
+from gnn_policy.settings import check_types
+from mapf_env.arguments import share
 from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
@@ -19,6 +20,7 @@ Recipe = Literal["quick", "full", "paper"]
 RobotOrder = Literal["index", "random", "farthest", "nearest"]
 Aggregation = Literal["visited", "stuck"]
 Backend = Literal["direct", "process"]
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +55,8 @@ class TrainConfig:
     """T_max in makespans of the expert's solution."""
 
     teacher: str = "ecbs"
-    """Who shows the moves: "ecbs", "lacam", "prioritised", "pibt", or a solver of your own as "module:function"."""
+    """The solver that shows the moves: "ecbs", "lacam", "prioritised", "pibt", or one of your own as
+    "module:function"."""
     w: float = 1.05
     """ECBS's cost is at most w times the lower bound of the optimum, where it teaches and where its plans set T_max;
     other teachers are asked without a w."""
@@ -114,11 +117,11 @@ class TrainConfig:
     validate_every: int = 5
     """Rounds from one validation to the next."""
     seed: int = 0
-    """Of the weights, batches and rollouts."""
+    """Random seed for weights, batches and rollouts."""
     data_seed: int = 0
-    """Of the maps and cases of all three splits."""
+    """Random seed for the maps and cases of all three splits."""
     threads: int = 0
-    """CPU threads; 0 takes all that the process may use."""
+    """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
     precision: Precision = "auto"
     """In which numbers the network computes in training: "bfloat16", "float32", or "auto", the first where the
     hardware has it."""
@@ -126,6 +129,7 @@ class TrainConfig:
     """Where the network lives."""
 
     def __post_init__(self) -> None:
+        check_types(self)
         positive = (
             "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
             "expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
@@ -135,20 +139,12 @@ class TrainConfig:
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
         for name in ("dagger_every", "weight_decay", "seed", "data_seed", "threads"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("beta_decay", "fresh_share", "beta1"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
-        for name, choices in (
-            ("robot_order", get_args(RobotOrder)),
-            ("aggregation", get_args(Aggregation)),
-            ("backend", get_args(Backend)),
-            ("shield", get_args(Shield)),
-            ("precision", get_args(Precision)),
-        ):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)}")
+        for name in ("density", "beta_decay", "fresh_share"):
+            share(getattr(self, name), name)
+        if not 0 <= self.beta1 < 1:
+            raise ValueError(f"beta1 must lie in [0, 1), got {self.beta1}")
         for name in ("seed", "data_seed"):
             if getattr(self, name) >= 2**64:
                 raise ValueError(f"{name} must be below 2**64, got {getattr(self, name)}")
@@ -168,7 +164,7 @@ class TrainConfig:
         }[split]
 
     def refuse_other(self, found: TrainConfig, what: str, option: str) -> None:
-        """Accept found settings only if they are these, but for where it runs: threads and device.
+        """Accept found settings only if they are these, except for `threads` and `device`.
 
         Args:
             found: The settings of what is there.
@@ -195,27 +191,41 @@ class TrainConfig:
             ValueError: If the file is damaged or has settings that this version does not know.
         """
         try:
-            return TrainConfig.from_json(path.read_text())
+            return TrainConfig.from_json(path.read_text(encoding="utf-8"))
         except ValueError as damage:
-            raise ValueError(f"{path}: {damage}") from None
+            raise ValueError(f"{path}: {damage}") from damage
 
     @staticmethod
-    def from_json(text: str) -> TrainConfig:
-        """The settings that `to_json` wrote.
+    def from_json(text: str, *, ignore_unknown: bool = False) -> TrainConfig:
+        """Return the settings that `to_json` wrote.
+
+        Args:
+            text: The settings.
+            ignore_unknown: Leave out settings that this version does not know, such as those of a newer one.
 
         Raises:
-            ValueError: If the text is damaged or has settings that this version does not know.
+            ValueError: If the text is damaged, a value has the wrong type or lies out of range, or a setting is unknown
+                and not left out.
         """
         try:
-            settings = json.loads(text)
-            nested = {"policy": PolicyConfig(**settings["policy"]), "styles": tuple(settings["styles"])}
-            return TrainConfig(**{**settings, **nested})
-        except (json.JSONDecodeError, KeyError, TypeError) as damage:
-            raise ValueError(f"no settings of this version of mapf-env ({damage})") from None
+            settings = _table(json.loads(text), TrainConfig, ignore_unknown)
+            policy = PolicyConfig(**_table(settings.pop("policy"), PolicyConfig, ignore_unknown))
+            styles = settings.pop("styles")
+            return TrainConfig(policy=policy, styles=tuple(styles) if isinstance(styles, list) else styles, **settings)
+        except (ValueError, KeyError, TypeError, RecursionError) as damage:
+            raise ValueError(f"no settings of this version of mapf-env ({damage})") from damage
 
     def to_json(self) -> str:
         """The settings as text."""
         return json.dumps(asdict(self), indent=2) + "\n"
+
+
+def _table(found: Any, kind: type, ignore_unknown: bool) -> dict[str, Any]:
+    """Return a JSON object as arguments of a dataclass."""
+    if not isinstance(found, dict):
+        raise TypeError(f"expected an object of settings, got {type(found).__name__}")
+    known = {each.name for each in fields(kind)}
+    return {name: value for name, value in found.items() if name in known or not ignore_unknown}
 
 
 _QUICK = TrainConfig(

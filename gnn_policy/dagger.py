@@ -25,8 +25,9 @@ import experts
 from experts.many import SOLVER_NAMES
 from gnn_policy.config import Backend, RobotOrder, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
+from gnn_policy.finite import require_finite
 from gnn_policy.network import DecentralizedPolicy
-from gnn_policy.own_parts import own_part
+from gnn_policy.plugins import import_by_name
 from gnn_policy.precision import autocast
 from gnn_policy.ranks import Ranks
 from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
@@ -62,7 +63,7 @@ class Teacher:
     ) -> None:
         self._instances, self._w, self._robot_order = instances, w, robot_order
         self._node_limit, self._threads, self._clock = node_limit, threads, clock
-        self._solver = solver if solver in SOLVER_NAMES else own_part(solver, "the teacher", SOLVER_NAMES)
+        self._solver = solver if solver in SOLVER_NAMES else import_by_name(solver, "the teacher", SOLVER_NAMES)
         self._goals = np.stack([each.goals for each in instances])
         self.seconds = 0.0
         """Time that it has taken to answer, so far."""
@@ -210,6 +211,7 @@ class Mixture(TensorDictModuleBase):
             device = self.policy.head.weight.device
             with autocast(self.config.precision, device):
                 values = self.policy(tensordict[FOV].to(device), tensordict[GRAPH].to(device)).float().cpu()
+            require_finite({"logits": values}, "the network's logits")
             if self.config.sample_rollouts:  # the greatest of the logits with Gumbel noise is a draw from the softmax
                 values -= torch.empty_like(values).exponential_(generator=self._random).log()
         if by_expert.any():

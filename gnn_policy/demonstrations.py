@@ -14,8 +14,8 @@ import torch
 from tensordict import TensorDict
 
 from gnn_policy import symmetry
-from gnn_policy.network import PolicyConfig
 from gnn_policy.perception import Perception
+from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.team_env import FOV, GRAPH
 from mapf_env import Instance, rules
 from mapf_env.files import replacing

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import torch
 import tyro
 from rich.console import Console
 
 from gnn_policy import checkpoint
-from gnn_policy.command_line import cpu_threads, mistakes_in_one_line, on_device
-from gnn_policy.examination import examine
+from gnn_policy.command_line import run_command
+from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
+from gnn_policy.results_file import refuse_other_settings, settings_of, variants_of_training
 from mapf_env.generation import MapStyle
 
 
@@ -54,13 +53,13 @@ class Command:
     """Obstacles: independent "cells", short "walls", or "maze", "room", "warehouse" and "empty", which heed no
     density; the maps take turns among the styles."""
     data_seed: int | None = None
-    """Of the maps and cases; any seed gives maps that training with it does not use."""
+    """Random seed for the maps and cases; any seed gives maps that training with it does not use."""
     w: float | None = None
     """Bound of the expert whose makespans set T_max and whose flowtimes are compared with."""
     timeout: float | None = None
     """T_max in makespans of the expert's solution."""
     seed: int | None = None
-    """Of sampling and of the shield's tie-breaking."""
+    """Random seed for sampling and for the shield's tie-breaking."""
     failures: int = 0
     """How many cases of the first row to replay beside the expert's solutions, in failures.html: the worst of each kind
     of failure, then the next worst."""
@@ -68,42 +67,62 @@ class Command:
     """Folder for results.json and pictures; if not given, evaluation/ in the run folder or beside the file, and
     evaluation/NAME in the working folder for a policy that comes with the package."""
     threads: int = 0
-    """CPU threads; 0 takes all that the process may use."""
+    """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
     device: str = "cpu"
     """Where the network computes, as in "cuda"."""
+    plugins: tuple[str, ...] = ()
+    """Encoders and graph layers of your own, as "module:Class", that the policy's file may import."""
+    debug: bool = False
+    """Print the traceback of an error."""
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """The command that the arguments ask for."""
+    return tyro.cli(Command, args=arguments, prog="python -m gnn_policy.evaluate")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
-    with mistakes_in_one_line():
-        command = tyro.cli(
-            Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.evaluate"
-        )
-        policy = on_device(checkpoint.load(command.run), command.device)
-        names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
-        given = {name: value for name in names if (value := getattr(command, name)) is not None}
-        prefix = "validation_" if command.split == "validation" else ""
-        if command.maps is not None:
-            given[f"{command.split}_maps"] = command.maps
-        if command.cases_per_map is not None:
-            given[f"{prefix}cases_per_map"] = command.cases_per_map
-        config = replace(checkpoint.trained_with(command.run), **given)
-        variants = None if command.rows is None else [Execution.parse(row, config.shield) for row in command.rows]
-        folder = command.out or _home(command.run)
-        folder.mkdir(parents=True, exist_ok=True)
-        threads = cpu_threads(command.threads)
-        torch.set_num_threads(threads)
-        examine(
-            policy,
-            config,
-            folder,
-            Console(),
-            num_agents=command.num_agents,
-            variants=variants,
-            split=command.split,
-            threads=threads,
-            failures=command.failures,
-        )
+    run_command(parse, _evaluate, arguments)
+
+
+def _evaluate(command: Command) -> None:
+    """Refuse what can be refused without torch, then evaluate."""
+    names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
+    given = {name: value for name in names if (value := getattr(command, name)) is not None}
+    prefix = "validation_" if command.split == "validation" else ""
+    if command.maps is not None:
+        given[f"{command.split}_maps"] = command.maps
+    if command.cases_per_map is not None:
+        given[f"{prefix}cases_per_map"] = command.cases_per_map
+    config = replace(checkpoint.trained_with(command.run), **given)
+    variants = variants_of_training(config)
+    if command.rows is not None:
+        variants = [Execution.parse(row, config.shield) for row in command.rows]
+    threads = cpu_threads(command.threads)
+    folder = command.out or _home(command.run)
+    settings = settings_of(config, command.num_agents, variants, command.split)
+    refuse_other_settings(folder / "results.json", settings, "--out")
+
+    import torch
+
+    from gnn_policy.command_line import on_device
+    from gnn_policy.examination import examine
+
+    torch.set_num_threads(threads)
+    policy = on_device(checkpoint.load(command.run, plugins=command.plugins), command.device)
+    folder.mkdir(parents=True, exist_ok=True)
+    examine(
+        policy,
+        config,
+        folder,
+        Console(),
+        num_agents=command.num_agents,
+        variants=variants,
+        split=command.split,
+        threads=threads,
+        failures=command.failures,
+    )
 
 
 def _home(run: Path) -> Path:

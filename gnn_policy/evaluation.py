@@ -190,25 +190,26 @@ def _expert_score(exam: Exam) -> Score:
     return Score("expert*", Estimate.proportion(solved), zero, zero, Estimate.average(makespans), 1.0)
 
 
-def table(title: str, rows: Sequence[Score], exam: Exam) -> Table:
-    """The rows for the terminal, at most 80 columns wide."""
-    shown = Table(title=title, caption=_caption(exam), box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+def table(title: str, result: dict[str, Any]) -> Table:
+    """What `as_json` returns as a table for the terminal, at most 80 columns wide."""
+    shown = Table(title=title, caption=_caption(result), box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
     shown.add_column("", overflow="fold")
     for heading in ("success rate", "flowtime\nincrease", "of solved\ncases", "make-\nspan", "lat-\nched"):
         shown.add_column(heading, justify="right", no_wrap=True)
-    for row in rows:
+    for row in result["rows"]:
+        rate, makespan = row["success_rate"], row["makespan"]["mean"]
         shown.add_row(
-            row.name,
-            _share(row.success_rate),
-            _percent(row.flowtime_increase),
-            _percent(row.flowtime_increase_solved),
-            "-" if math.isnan(row.makespan.mean) else f"{row.makespan.mean:.1f}",
-            f"{row.latched:.3f}",
+            row["name"],
+            f"{rate['mean']:.3f} \\[{rate['low']:.3f}, {rate['high']:.3f}]",
+            _percent(row["flowtime_increase"]),
+            _percent(row["flowtime_increase_solved"]),
+            "-" if makespan is None else f"{makespan:.1f}",
+            f"{row['latched']:.3f}",
         )
     return shown
 
 
-def as_json(rows: Sequence[Score], exam: Exam) -> dict[str, object]:
+def as_json(rows: Sequence[Score], exam: Exam) -> dict[str, Any]:
     """The rows as plain data; null stands for what is not a finite number."""
     plain = [_finite(asdict(row)) for row in rows]
     return {
@@ -230,20 +231,19 @@ def _over_bound(exam: Exam) -> float:
     return float((np.maximum(exam.flowtimes, 1) / np.maximum(exam.lower_bounds, 1)).mean())
 
 
-def _caption(exam: Exam) -> str:
+def _caption(result: dict[str, Any]) -> str:
     lines = [
-        f"{len(exam.instances)} cases, 95 % intervals; T_max follows from the expert's makespan",
-        f"the expert's flowtime is {_over_bound(exam):.4f} x its lower bound",
+        f"{result['cases']} cases, 95 % intervals; T_max follows from the expert's makespan",
+        f"the expert's flowtime is {result['expert_over_bound']:.4f} x its lower bound",
         "stuck: robots draw where they are stuck; * knows the whole map",
     ]
-    if exam.unsolved:
-        lines.append(f"{exam.unsolved} more cases are left out: the expert did not solve them")
+    if result["unsolved_by_expert"]:
+        lines.append(f"{result['unsolved_by_expert']} more cases are left out: the expert did not solve them")
     return "\n".join(lines)
 
 
-def _share(estimate: Estimate) -> str:
-    return f"{estimate.mean:.3f} \\[{estimate.low:.3f}, {estimate.high:.3f}]"
-
-
-def _percent(estimate: Estimate) -> str:
-    return "-" if math.isnan(estimate.mean) else f"{estimate.mean:+.1%} ±{100 * (estimate.high - estimate.mean):.1f}"
+def _percent(estimate: dict[str, float | None]) -> str:
+    mean, high = estimate["mean"], estimate["high"]
+    if mean is None:
+        return "-"
+    return f"{mean:+.1%} ±{math.inf if high is None else 100 * (high - mean):.1f}"

@@ -8,8 +8,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gnn_policy.network import CommRange, CommWeights, PolicyConfig
+from gnn_policy.policy_config import CommRange, CommWeights, PolicyConfig
 from mapf_env import EnvConfig, _native
+from mapf_env.arguments import number
 from mapf_env.rules import Positions
 
 Sample = Literal[False, True, "stuck"]
@@ -53,7 +54,7 @@ class Execution:
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, known))}, got {getattr(self, name)!r}")
-        if not 0 < self.temperature < np.inf:
+        if not 0 < number(self.temperature, "temperature") < np.inf:
             raise ValueError(
                 f"temperature must be positive and finite, got {self.temperature}; "
                 "for the most probable move: sample=False"
@@ -73,13 +74,24 @@ class Execution:
             alarmed: (...) who is stuck or hears a robot that is.
             seeds: (...) the robots' seeds.
             time: Steps since the start.
+
+        Raises:
+            ValueError: If a logit, or a logit over the temperature, is not finite.
         """
+        if not np.isfinite(logits).all():
+            raise ValueError(
+                "the policy's logits are not finite: its weights or what it observes are damaged, or its training "
+                "diverged; train it again with a smaller lr"
+            )
         draws = alarmed if self.sample == "stuck" else np.full_like(alarmed, self.sample)
         if not draws.any():
             return logits
         noise = -np.log(-np.log(uniform(seeds[draws], time, logits.shape[-1]).clip(1e-12, 1 - 1e-12)))
         values = logits.copy()
-        values[draws] = logits[draws] / self.temperature + noise
+        with np.errstate(all="ignore"):
+            values[draws] = logits[draws] / self.temperature + noise
+        if not np.isfinite(values).all():
+            raise ValueError(f"the logits over a temperature of {self.temperature} are not finite: give a higher one")
         return values
 
     def perceived(self, policy: PolicyConfig) -> EnvConfig:
@@ -100,7 +112,7 @@ class Execution:
         return ",".join([*words, *(each for each in (self.comm_range, self.comm_weights) if each)])
 
     @staticmethod
-    def parse(text: str, shield: Shield = "idle") -> Execution:
+    def parse(text: str, shield: str = "idle") -> Execution:
         """The variant of the given name, its words in any order.
 
         Args:

@@ -3,71 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from gnn_policy.convolution import StridedConvolution
-from gnn_policy.own_parts import own_part
+from gnn_policy.plugins import import_by_name
+from gnn_policy.policy_config import PolicyConfig
 from mapf_env import Action
-
-CommRange = Literal["fixed", "connected"]
-CommWeights = Literal["binary", "distance"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PolicyConfig:
-    """All that defines a policy besides its weights; the defaults are the paper's."""
-
-    encoder: str = "released"
-    """CNN that reads a view: "released" is that of the paper's released code (5 convolutions, 3 poolings), "lean" has
-    3 convolutions without poolings and costs a third; or a class of your own as "module:Class", made as `lean_encoder`
-    is."""
-    graph_layer: str = "filter"
-    """How robots use what they hear: "filter" is the paper's graph filter; or a class of your own as "module:Class",
-    made and called as `GraphFilter` is."""
-    features: int = 128
-    """Features F that a robot extracts and communicates."""
-    taps: int = 3
-    """Filter taps K: K - 1 hops of communication; K = 1 is none."""
-    fov_radius: int = 4
-    """How many cells a robot sees in each direction (r_FOV)."""
-    comm_radius: float = 5.0
-    """Robots closer than this hear each other, in cells (r_COMM)."""
-    comm_range: CommRange = "fixed"
-    """"connected": at the start of a case comm_radius grows by 10 % until the team is connected, as in the released
-    code."""
-    comm_weights: CommWeights = "binary"
-    """Weights of the communication graph: 1, or with "distance" 1 / distance."""
-    cost_to_go: bool = False
-    """See how many steps it is to the goal from each cell in view: a fourth channel, which needs the whole map."""
-
-    def __post_init__(self) -> None:
-        for name, parts in (("encoder", ENCODERS), ("graph_layer", GRAPH_LAYERS)):
-            given = getattr(self, name)
-            if given not in parts and ":" not in given:
-                raise ValueError(f"{name} must be one of {', '.join(parts)}, or 'module:Class', got {given!r}")
-        for name, known in (
-            ("comm_range", get_args(CommRange)),
-            ("comm_weights", get_args(CommWeights)),
-        ):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
-        for name, least in (("features", 1), ("taps", 1), ("fov_radius", 2)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        if not self.comm_radius >= 0:
-            raise ValueError(f"comm_radius must not be negative, got {self.comm_radius}")
-        if self.comm_range == "connected" and self.comm_radius == 0:
-            raise ValueError('comm_radius must be positive to grow, got 0.0 with comm_range "connected"')
-
-    @property
-    def channels(self) -> int:
-        """Channels C of a view."""
-        return 4 if self.cost_to_go else 3
 
 
 def released_encoder(channels: int, side: int, features: int) -> nn.Sequential:
@@ -145,8 +89,7 @@ def _part(what: str, name: str, known: Mapping[str, Callable[..., nn.Module]]) -
     """What makes the part of a network that has this name."""
     if name in known:
         return known[name]
-    part = own_part(name, what, known)
-    # Nothing else is called, for the name may come from a file.
+    part = import_by_name(name, what, known)
     if not (isinstance(part, type) and issubclass(part, nn.Module)):
         raise ValueError(f"{what} must be a class of torch.nn.Module, which {name!r} is not")
     return part

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gnn_policy.network import CommRange, CommWeights, PolicyConfig
+from gnn_policy.policy_config import CommRange, CommWeights, PolicyConfig
 from mapf_env import Instance, rules
 
 

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 from rich.console import Console
 
 from gnn_policy import checkpoint
-from gnn_policy.command_line import cpu_threads, mistakes_in_one_line, on_device
+from gnn_policy.command_line import run_command
+from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
-from gnn_policy.failures import failure
-from gnn_policy.rollout import rollout
 from mapf_env import Instance, _native, replay
+from mapf_env.arguments import integer
 from mapf_env.problem_file import load_problem
 
 PATIENCE = 4
@@ -45,47 +43,65 @@ class Command:
     max_steps: int | None = None
     """T_max; four times the longest way that a robot has to go if not given."""
     seed: int = 0
-    """Of the robots' places, the draws and the shield's tie-breaking."""
+    """Random seed for the robots' places, the draws and the shield's tie-breaking."""
     out: Path | None = None
     """The page; the name of FILE with .html in the working folder if not given."""
     threads: int = 0
-    """CPU threads; 0 takes all that the process may use."""
+    """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
     device: str = "cpu"
     """Where the network computes, as in "cuda"."""
+    plugins: tuple[str, ...] = ()
+    """Encoders and graph layers of your own, as "module:Class", that the policy's file may import."""
+    debug: bool = False
+    """Print the traceback of an error."""
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """The command that the arguments ask for."""
+    return tyro.cli(Command, args=arguments, prog="python -m gnn_policy.play")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
-    with mistakes_in_one_line():
-        command = tyro.cli(
-            Command, args=sys.argv[1:] if arguments is None else arguments, prog="python -m gnn_policy.play"
-        )
-        torch.set_num_threads(cpu_threads(command.threads))
-        policy = on_device(checkpoint.load(command.run), command.device)
-        execution = Execution.parse(command.row, checkpoint.trained_with(command.run).shield)
-        instance = load_problem(
-            command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed
-        )
-        steps = _patience(instance) if command.max_steps is None else command.max_steps
-        out = command.out or Path(f"{command.file.stem}.html")
-        if not out.parent.is_dir():
-            raise FileNotFoundError(f"{out.parent} is no folder: make it, or give another --out")
-        if out.is_dir():
-            raise FileExistsError(f"{out} is a folder: give the name of a file with --out")
-        console = Console()
-        size = f"{instance.num_agents} robots on {instance.grid.shape[0]} x {instance.grid.shape[1]} cells"
-        before = time.perf_counter()
-        with console.status(f"{size}, {steps} steps at most"):
-            played = rollout(policy, [instance], seed=command.seed, max_steps=steps, **asdict(execution))
-        seconds = time.perf_counter() - before
-        (solution,) = played.solutions
-        home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
-        kind = failure(instance, solution)
-        told = f"{size}: {home} on goal after {len(solution.paths) - 1} steps"
-        told += f", flowtime {solution.sum_of_costs}" if kind is None else f", failed: {kind}"
-        replay(instance, solution, out, title=told, config=execution.perceived(policy.config))
-        console.print(f"{told} ({seconds:.1f} s)", highlight=False)
-        console.print(f"replay: {out}", highlight=False, soft_wrap=True)
+    run_command(parse, _play, arguments)
+
+
+def _play(command: Command) -> None:
+    """Refuse what can be refused without torch, then play."""
+    threads = cpu_threads(command.threads)
+    execution = Execution.parse(command.row, checkpoint.trained_under(command.run))
+    instance = load_problem(
+        command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed
+    )
+    steps = _patience(instance) if command.max_steps is None else integer(command.max_steps, "max_steps", 1)
+    out = command.out or Path(f"{command.file.stem}.html")
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"{out.parent} is no folder: make it, or give another --out")
+    if out.is_dir():
+        raise FileExistsError(f"{out} is a folder: give the name of a file with --out")
+
+    import torch
+
+    from gnn_policy.command_line import on_device
+    from gnn_policy.failures import failure
+    from gnn_policy.rollout import rollout
+
+    torch.set_num_threads(threads)
+    policy = on_device(checkpoint.load(command.run, plugins=command.plugins), command.device)
+    console = Console()
+    size = f"{instance.num_agents} robots on {instance.grid.shape[0]} x {instance.grid.shape[1]} cells"
+    before = time.perf_counter()
+    with console.status(f"{size}, {steps} steps at most"):
+        played = rollout(policy, [instance], seed=command.seed, max_steps=steps, **asdict(execution))
+    seconds = time.perf_counter() - before
+    (solution,) = played.solutions
+    home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
+    kind = failure(instance, solution)
+    told = f"{size}: {home} on goal after {len(solution.paths) - 1} steps"
+    told += f", flowtime {solution.sum_of_costs}" if kind is None else f", failed: {kind}"
+    replay(instance, solution, out, title=told, config=execution.perceived(policy.config))
+    console.print(f"{told} ({seconds:.1f} s)", highlight=False)
+    console.print(f"replay: {out}", highlight=False, soft_wrap=True)
 
 
 def _patience(instance: Instance) -> int:

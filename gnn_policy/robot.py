@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 
 from gnn_policy.execution import STUCK_MEMORY, Execution
+from gnn_policy.finite import require_finite
 from gnn_policy.network import DecentralizedPolicy, GraphFilter
 
 Features = npt.NDArray[np.float32]
@@ -66,7 +67,8 @@ class Robot:
         seed: Of its draws; robots of one team need different ones.
 
     Raises:
-        ValueError: If the policy has another graph layer than the graph filter, or the seed is out of range.
+        ValueError: If the policy has another graph layer than the graph filter or weights that are not finite, or the
+            seed is out of range.
     """
 
     def __init__(self, policy: DecentralizedPolicy, execution: Execution = Execution(), seed: int = 0) -> None:
@@ -77,6 +79,7 @@ class Robot:
                 f"robots on their own exchange the messages of a graph filter, but this policy has the graph layer "
                 f"{policy.config.graph_layer!r}: play it by rollout"
             )
+        require_finite(policy.state_dict())
         self._policy, self._filter, self._execution = policy.eval(), policy.filter, execution
         self._seed = np.array(seed, np.uint64)
         self.reset()
@@ -109,13 +112,16 @@ class Robot:
             cell: Row and column of where it stands, in any frame that stays the same, as its odometry's.
 
         Raises:
-            ValueError: If the view is not one that the policy reads, or a weight is not positive.
+            ValueError: If the view is not one that the policy reads, a feature of it is not finite, or a weight is not
+            positive and finite.
         """
         wrong = [name for name, weight in links.items() if not 0 < weight < np.inf]
         if wrong:
             raise ValueError(f"links must have positive weights, got {links[wrong[0]]} to {wrong[0]!r}")
         with torch.inference_mode():
             extracted = self._policy.extract(self._tensor(view)[None])[0].cpu().numpy()
+        if not np.isfinite(extracted).all():
+            raise ValueError("the features of the view are not finite numbers: check the view and the policy's weights")
         self._time += 1
         self._links, self._gathered = dict(links), [extracted]
         place, centre = tuple(int(each) for each in cell), view.shape[-1] // 2
@@ -134,7 +140,7 @@ class Robot:
         """Take the messages of this round that came, by the names of the links.
 
         Raises:
-            ValueError: If one is of no link, or of another policy.
+            ValueError: If one is of no link, or of another policy, or has features that are not finite.
             RuntimeError: If the rounds of the step are over.
         """
         own = self.message.features
@@ -144,6 +150,10 @@ class Robot:
         for name, message in messages.items():
             if message.features.shape != own.shape:
                 raise ValueError(f"{name!r} sent {message.features.shape} features, this policy has {own.shape}")
+            if not np.isfinite(message.features).all():
+                raise ValueError(
+                    f"{name!r} sent features that are not finite: leave the message out as if it were lost"
+                )
             total += np.float32(self._links[name]) * message.features
             self._alarmed |= message.stuck
         self._gathered.append(self._scaled(total))
@@ -153,12 +163,16 @@ class Robot:
 
         Raises:
             RuntimeError: If rounds are missing.
+            ValueError: If they are not finite.
         """
         if len(self._gathered) != self.rounds + 1:
             raise RuntimeError(f"it heard {len(self._gathered) - 1} of {self.rounds} rounds: begin() and hear() first")
         with torch.inference_mode():
             filtered = self._filter.mix(self._tensor(np.concatenate(self._gathered)))
-            return self._policy.decide(filtered).cpu().numpy()
+            logits = self._policy.decide(filtered).cpu().numpy()
+        if not np.isfinite(logits).all():
+            raise ValueError("the logits are not finite numbers: check the messages and the policy's weights")
+        return logits
 
     def values(self) -> Features:
         """(5,) what each move is worth to it: logits and the noise of its draws. The PIBT shield heeds their order.

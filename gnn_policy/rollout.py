@@ -21,8 +21,8 @@ from gnn_policy.execution import (
     is_stuck,
     robot_seeds,
 )
-from gnn_policy.network import CommRange, CommWeights, PolicyConfig
 from gnn_policy.perception import Perception
+from gnn_policy.policy_config import CommRange, CommWeights, PolicyConfig
 from mapf_env import Instance, Solution, _native, rules
 
 Cases = npt.NDArray[np.intp]
@@ -261,6 +261,8 @@ def _play(
         recent = history[max(time - actor.memory, 0) : time]
         past = np.stack(recent)[:, active] if recent else np.empty((0, *here.shape), here.dtype)
         wanted = actor.act(Teams(cases[active], draws, maps, here, goals[active], past, time))
+        if not np.isfinite(wanted).all():
+            raise ValueError(f"{type(actor).__name__}.act returned values that are not finite numbers")
         times = np.full(len(active), time)
         chosen = wanted.argmax(-1) if wanted.ndim == 3 else wanted
         if shield == "pibt":

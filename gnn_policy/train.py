@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import sys
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
 
-from gnn_policy import checkpoint
-from gnn_policy.command_line import mistakes_in_one_line, on_device
+from gnn_policy.command_line import run_command
 from gnn_policy.config import RECIPES, Recipe, TrainConfig
-from gnn_policy.examination import examine
-from gnn_policy.progress import TrainingProgress
-from gnn_policy.ranks import Ranks, join_ranks
-from gnn_policy.training import Training
+from gnn_policy.cores import cpu_threads
+from gnn_policy.results_file import read_tables, settings_of, table_title, variants_of_training
+from gnn_policy.run_folder import RESULTS, check_run, is_finished
+
+if TYPE_CHECKING:
+    from gnn_policy.ranks import Ranks
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class Command:
     that of the policies that come with the package, "paper" the paper's setup."""
     run: Path | None = None
     """The run folder; runs/RECIPE if not given."""
+    debug: bool = False
+    """Print the traceback of an error."""
 
 
 @dataclass(frozen=True)
@@ -50,28 +53,57 @@ def parse(arguments: Sequence[str]) -> Command:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
-    with mistakes_in_one_line():
-        command = parse(sys.argv[1:] if arguments is None else arguments)
-        with join_ranks() as ranks:
-            _train(command.config, command.run or Path("runs", command.recipe), Console(quiet=ranks.rank > 0), ranks)
+    run_command(parse, _start, arguments)
+
+
+def _start(command: Command) -> None:
+    """Refuse what can be refused without torch, then join the other processes and train."""
+    config, folder = command.config, command.run or Path("runs", command.recipe)
+    cpu_threads(config.threads)
+    if int(os.environ.get("RANK", "0")) == 0:
+        if is_finished(folder, config):
+            _show_finished(folder, config)
+            return
+        check_run(folder, config)
+    from gnn_policy.ranks import join_ranks
+
+    with join_ranks() as ranks:
+        _train(config, folder, Console(quiet=ranks.rank > 0), ranks)
+
+
+def _show_finished(folder: Path, config: TrainConfig) -> None:
+    from gnn_policy.evaluation import table
+
+    console, settings = Console(), settings_of(config, (), variants_of_training(config), "test")
+    for num_agents, result in read_tables(folder / RESULTS).items():
+        console.print(table(table_title(num_agents, settings), result))
+    console.print(f"{folder} holds a finished run: choose another folder with --run to train again", highlight=False)
 
 
 def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) -> None:
+    from gnn_policy import checkpoint
+    from gnn_policy.command_line import on_device
+    from gnn_policy.examination import examine
+    from gnn_policy.progress import TrainingProgress
+    from gnn_policy.training import Training
+
     progress = TrainingProgress(config.epochs, console)
     training = Training(config, folder, progress, ranks)
     console.print(f"run folder: {folder}", highlight=False)
     if training.history:
         console.print(f"goes on after round {len(training.history)} of {config.epochs}", highlight=False)
-    try:
-        with progress:
-            training.run()
-    except KeyboardInterrupt:
-        console.print(f"stopped; the same command goes on after round {len(training.history)}", highlight=False)
-        raise SystemExit(130) from None
-    if ranks.rank > 0:
-        return
-    policy = on_device(checkpoint.load(folder), config.device)
-    examine(policy, config, folder, console, threads=training.threads)
+    with training.lock:
+        try:
+            with progress:
+                training.run()
+        except KeyboardInterrupt:
+            console.print(f"stopped; the same command goes on after round {len(training.history)}", highlight=False)
+            raise SystemExit(130) from None
+        if ranks.rank > 0:
+            return
+        # The command line, which the run's settings agree with, has asked for its parts.
+        policy = checkpoint.load(folder, plugins=tuple(config.policy.plugins.values()))
+        examine(on_device(policy, config.device), config, folder, console, threads=training.threads)
     console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
     console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)
 

@@ -21,6 +21,7 @@ import csv
 import pickle
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,15 +29,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from filelock import FileLock, Timeout
 from torch.utils.tensorboard import SummaryWriter
 
 from gnn_policy import checkpoint, evaluation
 from gnn_policy.cases import Split, make_cases
-from gnn_policy.command_line import cpu_threads, on_device
+from gnn_policy.command_line import on_device
 from gnn_policy.config import TrainConfig
+from gnn_policy.cores import cpu_threads
 from gnn_policy.dagger import Aggregator, Teacher, teams_side_by_side
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
+from gnn_policy.finite import require_finite
 from gnn_policy.imitation import ImitationLoss
 from gnn_policy.learning_curve import Round, draw_learning_curve
 from gnn_policy.network import DecentralizedPolicy
@@ -44,8 +46,9 @@ from gnn_policy.precision import autocast
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.ranks import Ranks
 from gnn_policy.rollout import rollout
+from gnn_policy.run_folder import lock_run, open_run
 from mapf_env import Instance
-from mapf_env.files import remove_drafts, replacing
+from mapf_env.files import replacing
 
 
 def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None) -> list[Instance]:
@@ -64,58 +67,18 @@ def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None
     )
 
 
-class RunLockedError(FileExistsError):
-    """Another process is training in the run folder."""
-
-
-def lock_run(folder: Path) -> FileLock:
-    """Keep other processes out of a run folder, until the lock is released or this process ends.
-
-    Raises:
-        RunLockedError: If another process has it.
-    """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder.parent / f".{folder.name}.lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise RunLockedError(
-            f"another process is training in {folder}: wait for its end, or choose another folder with --run"
-        ) from None
-    return lock
-
-
-def open_run(folder: Path, config: TrainConfig) -> None:
-    """Make the run folder, or accept one that holds an unfinished run with the same settings.
-
-    Raises:
-        FileExistsError: If the folder holds something else.
-    """
-    if folder.is_dir():
-        for each in (folder, folder / "demonstrations"):
-            remove_drafts(each)
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        folder.mkdir(parents=True, exist_ok=True)
-        config.save(folder / "config.json")
-        return
-    if not (folder / "config.json").is_file():
-        raise FileExistsError(f"{folder} exists and is no training run: choose another folder with --run")
-    config.refuse_other(TrainConfig.load(folder / "config.json"), f"{folder} holds a run with", "--run")
-    if (folder / "results.json").exists():
-        raise FileExistsError(
-            f"{folder} holds a finished run: evaluate it with `python -m gnn_policy.evaluate {folder}`, "
-            "or choose another folder with --run"
-        )
-
-
 class Training:
     """A training run in its folder; `run` goes on from the last finished round.
 
+    `lock` keeps other processes out of the folder until `run` ends; enter it as a context manager around `run` to hold
+    it longer.
+
     Args:
-        config: Its settings.
-        folder: Its folder.
-        progress: Told what goes on.
-        clock: What seconds are measured by; `time.process_time` where the machine is shared.
+        config: The settings.
+        folder: The run folder.
+        progress: Shows each step of the work.
+        ranks: This process among those that train together.
+        clock: Measures seconds; `time.process_time` where the machine is shared.
 
     Raises:
         ValueError: If settings do not fit together, or a file of the run is damaged.
@@ -133,7 +96,7 @@ class Training:
         self.config, self.folder, self.progress, self.ranks = config, folder, progress, ranks
         ranks.share("batch_size", config.batch_size)
         teams_side_by_side(config, ranks)
-        self.threads = cpu_threads(config.threads) if config.threads else max(cpu_threads(0) // ranks.local_count, 1)
+        self.threads = cpu_threads(config.threads, ranks.local_count)
         torch.set_num_threads(self.threads)
         torch.manual_seed(config.seed)
         self.policy = on_device(DecentralizedPolicy(config.policy), config.device)
@@ -162,11 +125,12 @@ class Training:
         )
         self._shards: list[Demonstrations] = []
         found: dict[str, Any] | None = None
+        self.lock: AbstractContextManager[Any] = nullcontext()
         if ranks.rank == 0:
-            self._lock = lock_run(folder)
+            self.lock = self._lock = lock_run(folder)
             try:
                 open_run(folder, config)
-            except (ValueError, OSError):
+            except BaseException:
                 self._lock.release()
                 raise
             (folder / "demonstrations").mkdir(exist_ok=True)
@@ -276,11 +240,31 @@ class Training:
             outcome["loss_imitation"].backward()
             self.optimizer.step()
             losses[update], accuracies[update] = outcome["loss_imitation"].item(), outcome["accuracy"].item()
+            if not np.isfinite(losses[update]):
+                raise self._diverged(number, "the loss is not a finite number")
             self.progress.fitted(number, update + 1, updates, losses[: update + 1], robots)
         if self.ranks.count > 1:  # the last batch's statistics are each process's own
             self.policy.load_state_dict(self.ranks.from_first(self.policy.state_dict()))
+        try:
+            self._require_finite()
+        except ValueError as damage:
+            raise self._diverged(number, str(damage)) from damage
         means = self.ranks.average(torch.tensor([losses.mean(), accuracies.mean()])).tolist()
         return means[0], means[1], updates, sum(map(len, draws)) * config.num_agents
+
+    def _require_finite(self) -> None:
+        """Check the weights, the batch statistics and the optimiser's moments."""
+        require_finite(self.policy.state_dict())
+        for number, moments in self.optimizer.state_dict()["state"].items():
+            tensors = {f"{name} of parameter {number}": value for name, value in moments.items()}
+            require_finite({name: value for name, value in tensors.items() if torch.is_tensor(value)}, "Adam's moments")
+
+    def _diverged(self, number: int, why: str) -> ValueError:
+        kept = f"the state after round {number} is kept in {self.folder}" if number else f"{self.folder} has no policy"
+        return ValueError(
+            f"training diverged in round {number + 1} with lr {self.config.lr:g}: {why.partition(':')[0]}; {kept}: "
+            "choose a smaller --lr (or --weight-decay) and another folder with --run"
+        )
 
     def _pass(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[npt.NDArray[np.intp]]:
         """Every state once, in random order."""
@@ -343,8 +327,8 @@ class Training:
             return None
         try:
             return torch.load(file, weights_only=True, map_location="cpu")
-        except (pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError, RuntimeError):
-            raise self._damaged() from None
+        except (pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError, RuntimeError) as damage:
+            raise self._damaged(damage) from damage
 
     def _restore(self, state: dict[str, Any]) -> None:
         try:
@@ -353,8 +337,12 @@ class Training:
             self.optimizer.load_state_dict(state["optimizer"])
             self.scheduler.load_state_dict(state["scheduler"])
             self.history = [Round(**row) for row in state["history"]]
-        except (KeyError, TypeError, ValueError, RuntimeError):
-            raise self._damaged() from None
+            self._require_finite()
+            numbers = [each for row in state["history"] for each in row.values() if each is not None]
+            if not np.isfinite(np.array(numbers, np.float64)).all():
+                raise ValueError("a figure of a round is not a finite number")
+        except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, IndexError) as damage:
+            raise self._damaged(damage) from damage
         if processes != self.ranks.count:
             raise ValueError(
                 f"{self.folder} holds a run of {processes} processes, not of {self.ranks.count}: go on with as many, "
@@ -362,7 +350,8 @@ class Training:
             )
         self._seconds_before = self.history[-1].seconds
 
-    def _damaged(self) -> ValueError:
+    def _damaged(self, damage: Exception) -> ValueError:
+        why = str(damage).partition("\n")[0].partition(":")[0] or type(damage).__name__
         return ValueError(
-            f"{self.folder / 'state.pt'} is damaged: choose another folder with --run, or delete this one"
+            f"{self.folder / 'state.pt'} is damaged ({why}): choose another folder with --run, or delete this one"
         )

@@ -1,5 +1,7 @@
 """Settings of a training that takes a second."""
 
+from dataclasses import asdict
+
 from gnn_policy import PolicyConfig
 from gnn_policy.config import TrainConfig
 
@@ -24,3 +26,19 @@ CONFIG = TrainConfig(
     validate_every=2,
     threads=1,
 )
+
+
+def arguments_for(config, folder):
+    """The command line that asks for `config`."""
+    flags = ["--run", str(folder)]
+    for name, value in asdict(config).items():
+        for option, setting in (
+            [(f"policy.{each}", v) for each, v in value.items()] if name == "policy" else [(name, value)]
+        ):
+            *group, last = option.replace("_", "-").split(".")
+            if isinstance(setting, bool):
+                flags.append("--" + ".".join([*group, last if setting else f"no-{last}"]))
+            else:
+                flags.append("--" + ".".join([*group, last]))
+                flags += map(str, setting if isinstance(setting, tuple) else (setting,))
+    return flags

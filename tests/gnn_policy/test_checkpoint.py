@@ -2,14 +2,19 @@
 
 import json
 import os
+import subprocess
 import sys
+from dataclasses import asdict
 from types import ModuleType
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, Robot, checkpoint, evaluate, load, save
+from gnn_policy import DecentralizedPolicy, PolicyConfig, Robot, checkpoint, evaluate, load, play, save
+from gnn_policy.config import TrainConfig
+from mapf_env import save_map
 from own_layers import Deaf
 
 CONFIG = PolicyConfig(encoder="lean", features=8, taps=2, fov_radius=3, comm_radius=4.5)
@@ -49,11 +54,11 @@ def test_a_part_of_ones_own_returns_where_it_can_be_imported(tmp_path, monkeypat
         policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, graph_layer="my_parts:Own")).eval()
         save(policy, file)
         views, graph = torch.rand(2, 4, 3, 11, 11), torch.ones(2, 4, 4)
-        assert torch.equal(load(file)(views, graph), policy(views, graph))
+        assert torch.equal(load(file, plugins={"my_parts:Own"})(views, graph), policy(views, graph))
         with pytest.raises(ValueError, match=r"messages of a graph filter, but .* has the graph layer 'my_parts:Own'"):
             Robot(policy)
     with pytest.raises(checkpoint.CheckpointError, match="'my_parts:Own' cannot be found"):
-        load(file)
+        load(file, plugins=("my_parts:Own",))
 
 
 def test_other_networks_are_not_saved(tmp_path):
@@ -206,3 +211,148 @@ def test_a_crash_in_the_middle_of_saving_leaves_the_old_policy(policy, file, mon
             save(policy, file, command="another")
     assert file.read_bytes() == before
     assert os.listdir(file.parent) == [file.name]
+
+
+def own_file(tmp_path, monkeypatch, body, part="encoder"):
+    """A policy whose configuration names a class of `evil.py` in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "evil", raising=False)
+    (tmp_path / "evil.py").write_text(body)
+    torch.manual_seed(0)
+    save(DecentralizedPolicy(CONFIG), tmp_path / "evil.safetensors")
+    settings = {**json.loads(checkpoint.about(tmp_path / "evil.safetensors")["policy"]), part: "evil:Net"}
+    with_metadata(tmp_path / "evil.safetensors", policy=json.dumps(settings))
+    save_map("own.map", np.zeros((4, 4), bool))
+    return tmp_path / "evil.safetensors"
+
+
+COMMANDS = [(evaluate, ["evil.safetensors"]), (play, ["own.map", "--agents", "2", "--run", "evil.safetensors"])]
+
+
+@pytest.mark.parametrize("part", ["encoder", "graph_layer"])
+def test_a_file_imports_nothing_that_the_user_has_not_asked_for(tmp_path, monkeypatch, capsys, part):
+    file = own_file(tmp_path, monkeypatch, "open('ran', 'w')\nraise SystemExit(0)", part)
+    for plugins in ((), ("other:Net",), ["evil:Other"]):
+        with pytest.raises(checkpoint.CheckpointError, match=r"'evil:Net' from the module 'evil'.*--plugins evil:Net"):
+            load(file, plugins=plugins)
+    with pytest.raises(TypeError, match="plugins"):
+        load(file, plugins="evil:Net")
+    for command, arguments in COMMANDS:
+        with pytest.raises(SystemExit) as end:
+            command.main(arguments)
+        assert end.value.code == 2
+        told = capsys.readouterr().err
+        assert "'evil'" in told
+        assert told.count("\n") == 1
+    assert not (tmp_path / "ran").exists()
+    assert "evil" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    "body", ["raise SystemExit(0)", "import sys; sys.exit()", "1 / 0", "def", "raise RuntimeError('two\\nlines')"]
+)
+def test_a_module_that_fails_when_it_is_imported_is_an_error_in_one_line(tmp_path, monkeypatch, capsys, body):
+    own_file(tmp_path, monkeypatch, body)
+    for command, arguments in COMMANDS:
+        with pytest.raises(SystemExit) as end:
+            command.main([*arguments, "--plugins", "evil:Net"])
+        assert end.value.code == 2
+        told = capsys.readouterr().err
+        assert "evil:Net" in told
+        assert told.count("\n") == 1
+    assert not list(tmp_path.glob("*.html"))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"features": 25_000},
+        {"features": 2**31 - 1},
+        {"taps": 2**31 - 1},
+        {"fov_radius": 10_000},
+        {"fov_radius": 2**31 - 1},
+        {"cost_to_go": True},
+        {"encoder": "released", "features": 25_000},
+    ],
+)
+def test_sizes_in_a_file_are_compared_with_its_tensors_before_memory_is_allocated(file, settings):
+    with_metadata(file, policy=json.dumps({**json.loads(checkpoint.about(file)["policy"]), **settings}))
+    resource = pytest.importorskip("resource")  # not on Windows
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(checkpoint.CheckpointError, match=r"policy\.safetensors"):
+        load(file)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000, "kilobytes"
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("encoder", [5, None, [], {}, "", "none"]),
+        ("graph_layer", [5, None, [], "none"]),
+        ("features", ["8", 8.5, None, True, 0, -8, 2**40, 1e400]),
+        ("taps", ["2", 2.0, None, False, 0]),
+        ("fov_radius", [[3], "3", 1, None]),
+        ("comm_radius", ["4", None, True, -1, float("nan")]),
+        ("comm_range", [5, None, "far", []]),
+        ("comm_weights", [5, None, "heavy"]),
+        ("cost_to_go", [0, 1, "true", None]),
+    ],
+)
+def test_settings_of_a_wrong_type_or_range_are_refused_in_one_line_that_names_them(file, capsys, name, values):
+    for value in values:
+        with_metadata(file, policy=json.dumps({**json.loads(checkpoint.about(file)["policy"]), name: value}))
+        with pytest.raises(checkpoint.CheckpointError, match=name):
+            load(file)
+        with pytest.raises(SystemExit) as end:
+            evaluate.main([str(file)])
+        assert end.value.code == 2
+        assert capsys.readouterr().err.count("\n") == 1
+        with_metadata(file, policy=json.dumps(asdict(CONFIG)))
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "{" * 100_000, '{"a":' * 50_000, "[]", "nul", "1" * 5000])
+def test_settings_that_are_no_settings_are_refused(file, text, capsys):
+    with_metadata(file, policy=text)
+    with pytest.raises(checkpoint.CheckpointError, match=r"policy\.safetensors"):
+        load(file)
+    with_metadata(file, policy=json.dumps(asdict(CONFIG)), training=text)
+    assert load(file).config == CONFIG
+    with pytest.raises(SystemExit) as end:
+        evaluate.main([str(file)])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_newer_training_settings_stop_neither_play_nor_evaluation(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_map("own.map", np.zeros((4, 4), bool))
+    settings = {**json.loads(TrainConfig(policy=CONFIG, test_maps=3).to_json()), "momentum": [0.9], "shield": "pibt"}
+    settings["policy"]["dilation"] = 2
+    with_metadata(file, training=json.dumps(settings))
+    assert checkpoint.trained_with(file) == TrainConfig(policy=CONFIG, test_maps=3, shield="pibt")
+    play.main(["own.map", "--agents", "2", "--run", str(file), "--max-steps", "3"])
+    settings["styles"], settings["height"] = ["forest"], "tall"
+    with_metadata(file, training=json.dumps(settings))
+    assert load(file).config == CONFIG
+    play.main(["own.map", "--agents", "2", "--run", str(file), "--max-steps", "3", "--out", "second.html"])
+    assert (tmp_path / "second.html").exists()
+    with pytest.raises(checkpoint.CheckpointError, match="height"):
+        checkpoint.trained_with(file)
+
+
+def test_the_same_weights_make_the_same_file(policy, tmp_path):
+    notes = {f"note {number}": str(number) for number in range(20)}
+    for name in ("one", "two"):
+        save(policy, tmp_path / name, **notes)
+        notes = dict(reversed(notes.items()))
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+    assert load(tmp_path / "one").config == CONFIG
+    assert checkpoint.about(tmp_path / "one") == {**checkpoint.about(tmp_path / "two"), **notes}
+    program = (
+        "import sys, gnn_policy; policy = gnn_policy.load(sys.argv[1])\n"
+        "gnn_policy.save(policy, sys.argv[2], **{f'note {n}': str(n) for n in range(20)})"
+    )
+    for name in ("three", "four"):
+        subprocess.run([sys.executable, "-c", program, str(tmp_path / "one"), str(tmp_path / name)], check=True)
+        assert (tmp_path / name).read_bytes() == (tmp_path / "one").read_bytes()

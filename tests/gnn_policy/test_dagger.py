@@ -322,7 +322,7 @@ def test_a_solver_that_answers_another_question_is_found_out(cases, monkeypatch)
         ({"solver": "cbs"}, "one of ecbs, lacam, prioritised, pibt, or one of your own as .*; got 'cbs'"),
         ({"solver": "no.such.module:solve"}, "'no.such.module:solve' cannot be found: No module"),
         ({"solver": "experts:oracle"}, "'experts:oracle' cannot be found: .*oracle"),
-        ({"solver": "experts:__all__"}, "'experts:__all__' is no function or class but list"),
+        ({"solver": "experts:__all__"}, "'experts:__all__' is not a function or class but list"),
     ],
 )
 def test_a_teacher_that_cannot_teach_is_refused(cases, settings, message):

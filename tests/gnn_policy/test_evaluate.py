@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, save
+from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, examination, save
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 
@@ -40,7 +40,7 @@ def examined(monkeypatch, *arguments):
     """What the command would examine, and how."""
     calls = []
     monkeypatch.setattr(
-        evaluate, "examine", lambda policy, config, folder, console, **how: calls.append((config, folder, how))
+        examination, "examine", lambda policy, config, folder, console, **how: calls.append((config, folder, how))
     )
     evaluate.main(list(arguments))
     return calls[0]
@@ -53,7 +53,7 @@ def test_the_help_names_every_option(capsys, monkeypatch):
     text = capsys.readouterr().out
     for each in fields(evaluate.Command):
         assert (f"--{each.name.replace('_', '-')}" if each.name != "run" else "RUN") in text, each.name
-    assert "Of sampling and of the shield's tie-breaking" in text
+    assert "Random seed for sampling and for the shield's tie-breaking" in text
 
 
 def test_what_is_not_given_is_as_in_training(file, monkeypatch):

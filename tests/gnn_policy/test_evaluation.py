@@ -212,7 +212,7 @@ def test_the_numbers_are_strict_json_also_where_nothing_was_solved(compared):
 def test_the_table_shows_every_figure_within_eighty_columns(compared):
     exam, _, rows, _, _ = compared
     shown = io.StringIO()
-    Console(file=shown, width=80).print(evaluation.table("teams", rows, exam))
+    Console(file=shown, width=80).print(evaluation.table("teams", evaluation.as_json(rows, exam)))
     text = shown.getvalue()
     assert "…" not in text
     for row in rows:

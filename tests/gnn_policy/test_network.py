@@ -12,7 +12,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gnn_policy import DecentralizedPolicy, GraphFilter, PolicyConfig, shift_operator
+from gnn_policy import DecentralizedPolicy, GraphFilter, PolicyConfig, network, policy_config, shift_operator
 
 few = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -209,7 +209,7 @@ def test_parts_that_are_none_are_refused(part):
         ("mine", rf"{part} must be one of \w+(, \w+)*, or 'module:Class', got 'mine'"),
         ("no.such.module:Part", f"{part} must be .*; 'no.such.module:Part' cannot be found: No module"),
         ("my_parts:Other", f"{part} must be .*; 'my_parts:Other' cannot be found"),
-        ("my_parts:number", f"{part} must be .*; 'my_parts:number' is no function or class but int"),
+        ("my_parts:number", f"{part} must be .*; 'my_parts:number' is not a function or class but int"),
         ("my_parts:make", f"{part} must be a class of torch.nn.Module, which 'my_parts:make' is not"),
         ("os:kill", f"{part} must be a class of torch.nn.Module"),
     ]:
@@ -244,3 +244,8 @@ def test_bad_settings_are_refused_by_name(wrong, message):
 def test_the_released_encoder_refuses_views_that_it_would_pool_away():
     with pytest.raises(ValueError, match="fov_radius >= 3"):
         DecentralizedPolicy(PolicyConfig(fov_radius=2))
+
+
+def test_the_settings_know_the_names_of_all_parts():
+    assert tuple(network.ENCODERS) == policy_config.ENCODER_NAMES
+    assert tuple(network.GRAPH_LAYERS) == policy_config.GRAPH_LAYER_NAMES

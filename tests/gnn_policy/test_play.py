@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from dataclasses import asdict, fields
 
 import pytest
@@ -10,6 +11,8 @@ import torch
 import oracles
 from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, play, rollout, save
 from mapf_env import load_scen, random_instance, save_instances, save_map, save_scen
+
+ROLLOUT = sys.modules["gnn_policy.rollout"]  # the name in the package is the function
 
 
 @pytest.fixture
@@ -74,7 +77,9 @@ def test_robots_are_placed_on_a_map_by_the_seed(home):
 
 def test_every_option_reaches_the_rollout(home, monkeypatch):
     asked = []
-    monkeypatch.setattr(play, "rollout", lambda *given, **how: asked.append(how) or rollout(*given, **how))
+    monkeypatch.setattr(
+        sys.modules["gnn_policy.rollout"], "rollout", lambda *given, **how: asked.append(how) or rollout(*given, **how)
+    )
     for options in ([], ["--row", "argmax"], ["--row", "sampled,0.5,pibt", "--max-steps", "7"]):
         played("own.scen", "--seed", "3", *options)
     instance = load_scen("own.scen")
@@ -89,7 +94,11 @@ def test_every_option_reaches_the_rollout(home, monkeypatch):
 
 def test_a_policy_plays_under_the_shield_of_its_training(home, monkeypatch):
     asked = []
-    monkeypatch.setattr(play, "rollout", lambda *given, **how: asked.append(how["shield"]) or rollout(*given, **how))
+    monkeypatch.setattr(
+        sys.modules["gnn_policy.rollout"],
+        "rollout",
+        lambda *given, **how: asked.append(how["shield"]) or rollout(*given, **how),
+    )
     for run in ("n12-informed", "n12"):
         play.main(["own.scen", "--run", run, "--threads", "1"])
     assert asked == ["pibt", "idle"]

@@ -24,7 +24,7 @@ from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.training import Training, open_run, split_cases
 from own_layers import Deaf
-from small_training import CONFIG
+from small_training import CONFIG, arguments_for
 
 
 class Silence(TrainingProgress):
@@ -67,7 +67,7 @@ def metrics(folder):
 def test_a_graph_layer_of_ones_own_is_trained_and_loaded(tmp_path):
     config = replace(CONFIG, policy=replace(CONFIG.policy, graph_layer="own_layers:Deaf"))
     run = trained(config, tmp_path)
-    assert isinstance(load(tmp_path).filter, Deaf)
+    assert isinstance(load(tmp_path, plugins=["own_layers:Deaf"]).filter, Deaf)
     torch.manual_seed(config.seed)
     begun = DecentralizedPolicy(config.policy).state_dict()
     assert not torch.equal(weights(run)["filter.mix.weight"], begun["filter.mix.weight"])
@@ -369,22 +369,6 @@ os.replace = deadly_replace
 sys.stdout = open(os.devnull, "w")
 main(arguments)
 """
-
-
-def arguments_for(config, folder):
-    """The command line that asks for `config`."""
-    flags = ["--run", str(folder)]
-    for name, value in asdict(config).items():
-        for option, setting in (
-            [(f"policy.{each}", v) for each, v in value.items()] if name == "policy" else [(name, value)]
-        ):
-            *group, last = option.replace("_", "-").split(".")
-            if isinstance(setting, bool):
-                flags.append("--" + ".".join([*group, last if setting else f"no-{last}"]))
-            else:
-                flags.append("--" + ".".join([*group, last]))
-                flags += map(str, setting if isinstance(setting, tuple) else (setting,))
-    return flags
 
 
 def tensorboard_rounds(folder, name):
