@@ -21,6 +21,8 @@ from gnn_policy.execution import (
     is_stuck,
     robot_seeds,
 )
+from gnn_policy.finite import require_finite
+from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.perception import Perception
 from gnn_policy.policy_config import CommRange, CommWeights, PolicyConfig
 from mapf_env import Instance, Solution, _native, rules
@@ -67,6 +69,7 @@ class PolicyActor:
 
     Raises:
         TypeError: If the network has no `config`.
+        ValueError: If its weights are not finite.
     """
 
     def __init__(self, policy: nn.Module, instances: Sequence[Instance], execution: Execution) -> None:
@@ -77,6 +80,8 @@ class PolicyActor:
                 f"{kind} does not say what its robots perceive: give it a `config`, as {kind}.config = "
                 "gnn_policy.PolicyConfig(fov_radius=4, comm_radius=5.0)"
             )
+        weights = policy.state_dict() if isinstance(policy, DecentralizedPolicy) else dict(policy.named_parameters())
+        require_finite(weights)
         self.policy, self.config, self.execution = policy, config, execution
         self._perception = Perception(
             config, instances, comm_range=execution.comm_range, comm_weights=execution.comm_weights
@@ -171,7 +176,8 @@ def rollout(
         batch_size: How many teams are played at a time; it does not change the outcome.
 
     Raises:
-        ValueError: If the instances differ in size, or an argument is out of range.
+        ValueError: If the instances differ in size, an argument is out of range, or weights, logits or an actor's
+            values are not finite numbers.
         TypeError: If `policy` is none of these.
     """
     if not instances:

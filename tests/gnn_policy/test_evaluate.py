@@ -61,7 +61,7 @@ def test_what_is_not_given_is_as_in_training(file, monkeypatch):
     assert config == CONFIG
     assert how["num_agents"] == ()
     assert how["split"] == "test"
-    assert how["variants"] is None
+    assert how["variants"] == [Execution(), Execution(sample="stuck"), Execution(sample=True)]
     assert folder == file.parent / "evaluation"
 
 

@@ -113,7 +113,7 @@ def test_the_last_sound_state_is_kept_and_a_damaged_one_is_not_resumed(tmp_path,
             name = next(each for each in state["policy"] if each.endswith("running_mean"))
             state["policy"][name][0] = math.inf
         case "moments":
-            state["optimizer"]["state"][0]["exp_avg"].view(-1)[0] = math.nan
+            state["optimizer"]["state"][0]["exp_avg"].fill_(math.nan)
     torch.save(state, folder / "state.pt")
     with pytest.raises(ValueError, match=r"state\.pt is damaged .*not .*finite"):
         Training(config, folder, quiet(config))
