@@ -77,7 +77,11 @@ def _show_finished(folder: Path, config: TrainConfig) -> None:
     console, settings = Console(), settings_of(config, (), variants_of_training(config), "test")
     for num_agents, result in read_tables(folder / RESULTS).items():
         console.print(table(table_title(num_agents, settings), result))
-    console.print(f"{folder} holds a finished run: choose another folder with --run to train again", highlight=False)
+    console.print(
+        f"{folder} holds a finished run: choose another folder with --run to train again",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) -> None:

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, examination, save
+from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, evaluation, examination, save
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 
@@ -187,3 +187,32 @@ def test_a_policy_without_settings_meets_the_papers_cases(tmp_path, monkeypatch)
     save(DecentralizedPolicy(CONFIG.policy), tmp_path / "policy.safetensors")
     config, _, _ = examined(monkeypatch, str(tmp_path / "policy.safetensors"), "--maps", "1")
     assert config == replace(TrainConfig(), test_maps=1)
+
+
+def test_each_team_size_is_written_when_it_is_finished_and_not_played_again(file, monkeypatch, capsys):
+    numbers, sizes = file.parent / "evaluation" / "results.json", ["2", "3", "4"]
+    whole = file.parent / "whole"
+    evaluate.main([str(file), "--num-agents", *sizes, "--out", str(whole)])
+    compare, played = evaluation.compare, []
+
+    def interrupted(exam, *given, **options):
+        played.append(exam.instances[0].num_agents)
+        if len(played) == 3:
+            raise KeyboardInterrupt
+        return compare(exam, *given, **options)
+
+    monkeypatch.setattr(evaluation, "compare", interrupted)
+    with pytest.raises(SystemExit) as end:
+        evaluate.main([str(file), "--num-agents", *sizes])
+    assert end.value.code == 130
+    assert list(json.loads(numbers.read_text())["num_agents"]) == ["2", "3"]
+    capsys.readouterr()
+    evaluate.main([str(file), "--num-agents", *sizes])
+    assert played == [2, 3, 4, 4]
+    assert numbers.read_bytes() == (whole / "results.json").read_bytes()
+    assert (numbers.parent / "animation.svg").read_bytes() == (whole / "animation.svg").read_bytes()
+    shown = capsys.readouterr().out
+    assert all(f"{size} robots, 3 test maps" in shown for size in sizes)
+    evaluate.main([str(file), "--num-agents", *sizes])
+    assert played[4:] == [2, 3, 4], "a complete evaluation is repeated"
+    assert numbers.read_bytes() == (whole / "results.json").read_bytes()

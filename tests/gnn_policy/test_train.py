@@ -1,12 +1,16 @@
 """The command that trains: complete help, options of the settings, one line for a mistake."""
 
 import re
+import subprocess
+import sys
 from dataclasses import fields, replace
+from types import ModuleType
 
 import pytest
 
-from gnn_policy import PolicyConfig, train
+from gnn_policy import PolicyConfig, results_file, train
 from gnn_policy.config import RECIPES, TrainConfig
+from small_training import CONFIG, arguments_for
 
 
 def shown_help(capsys, command):
@@ -93,3 +97,68 @@ def test_a_finished_run_is_not_trained_over(tmp_path, capsys):
     with pytest.raises(SystemExit):
         train.main([*arguments, "--seed", "1"])
     assert capsys.readouterr().err.startswith(f"error: {tmp_path} holds a run with other settings (seed)")
+
+
+def test_a_teacher_whose_plans_are_wrong_stops_training_with_its_name_and_fault(tmp_path, monkeypatch, capsys):
+    module = ModuleType("lazy")
+    exec(
+        "import numpy as np, experts, mapf_env\n"
+        "def stay(instance):\n"
+        "    return experts.Result.of(mapf_env.Solution(np.stack([instance.starts] * 3)))\n"
+        "def leave(instance):\n"
+        "    raise SystemExit(0)\n"
+        "def guess(instance):\n"
+        "    return instance.starts\n",
+        module.__dict__,
+    )
+    monkeypatch.setitem(sys.modules, "lazy", module)
+    for name in ("stay", "leave", "guess"):
+        with pytest.raises(SystemExit) as end:
+            train.main(arguments_for(replace(CONFIG, teacher=f"lazy:{name}"), tmp_path / name))
+        assert end.value.code == 2
+        told = capsys.readouterr().err
+        assert told.startswith("error: ")
+        assert told.count("\n") == 1
+        assert name == "leave" or "stay" in told or "guess" in told
+        assert not (tmp_path / name / "best.safetensors").exists()
+
+
+def test_a_run_killed_in_its_final_evaluation_is_finished_by_the_same_command(tmp_path, monkeypatch, capsys):
+    folder, arguments = tmp_path / "run", arguments_for(CONFIG, tmp_path / "run")
+    written = []
+
+    def watched(path, *given, **options):
+        with pytest.raises(FileExistsError, match="another process is training"):
+            lock_in_another_process(folder)
+        written.append(path.name)
+        if len(written) == 1:
+            raise KeyboardInterrupt
+        return write_whole(path, *given, **options)
+
+    write_whole = results_file.write_whole
+    monkeypatch.setattr(results_file, "write_whole", watched)
+    with pytest.raises(SystemExit) as end:
+        train.main(arguments)
+    assert end.value.code == 130
+    assert not (folder / "results.json").exists()
+    state = (folder / "state.pt").read_bytes()
+    capsys.readouterr()
+    for attempt in ("finishes", "shows again"):
+        train.main(arguments)
+        shown = capsys.readouterr().out
+        assert "3 robots, 2 test maps" in shown, attempt
+        assert "expert*" in shown
+        assert (folder / "state.pt").read_bytes() == state
+    assert written == ["results.json", "results.json"]
+    assert "holds a finished run" in " ".join(shown.split())
+    with pytest.raises(SystemExit) as end:
+        train.main(arguments_for(replace(CONFIG, seed=1), folder))
+    assert end.value.code == 2
+
+
+def lock_in_another_process(folder):
+    """Raise what another process meets that wants to train in the folder."""
+    program = "import sys, pathlib; from gnn_policy.run_folder import lock_run; lock_run(pathlib.Path(sys.argv[1]))"
+    done = subprocess.run([sys.executable, "-c", program, str(folder)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise FileExistsError(done.stderr)
