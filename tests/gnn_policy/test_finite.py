@@ -68,7 +68,7 @@ def test_training_that_diverges_stops_with_one_line_and_no_policy(tmp_path, caps
 
 
 @pytest.mark.parametrize("where", ["loss", "weight", "statistics", "moments"])
-def test_the_last_sound_state_is_kept_and_a_damaged_one_is_not_resumed(tmp_path, where):
+def test_the_last_sound_state_is_kept_and_a_damaged_one_is_not_resumed(tmp_path, monkeypatch, where):
     config = replace(CONFIG, validate_every=1)
     folder = tmp_path / "run"
     run = Training(config, folder, quiet(config))
@@ -90,7 +90,7 @@ def test_the_last_sound_state_is_kept_and_a_damaged_one_is_not_resumed(tmp_path,
                 tensor.data[-1] = math.inf
         return outcome
 
-    run.loss.forward = poisoned
+    monkeypatch.setattr(run.loss, "forward", poisoned)
     with pytest.raises(ValueError, match=r"diverged in round 2 .*the state after round 1 is kept.*--lr"):
         run.run()
     assert sound["state.pt"]
