@@ -101,6 +101,8 @@ def _evaluate(command: Command) -> None:
         variants = [Execution.parse(row, config.shield) for row in command.rows]
     threads = cpu_threads(command.threads)
     folder = command.out or _home(command.run)
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"{folder} is not a folder: give another one with --out")
     settings = settings_of(config, command.num_agents, variants, command.split)
     refuse_other_settings(folder / "results.json", settings, "--out")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -45,7 +47,8 @@ class Command:
     seed: int = 0
     """Random seed for the robots' places, the draws and the shield's tie-breaking."""
     out: Path | None = None
-    """The page; the name of FILE with .html in the working folder if not given."""
+    """The page, which replaces a file of that name; if not given, the name of FILE with .html in the working folder, or
+    with a number if there is such a file."""
     threads: int = 0
     """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
     device: str = "cpu"
@@ -74,7 +77,7 @@ def _play(command: Command) -> None:
         command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed
     )
     steps = _patience(instance) if command.max_steps is None else integer(command.max_steps, "max_steps", 1)
-    out = command.out or Path(f"{command.file.stem}.html")
+    out = command.out or _free_name(command.file.stem)
     if not out.parent.is_dir():
         raise FileNotFoundError(f"{out.parent} is no folder: make it, or give another --out")
     if out.is_dir():
@@ -102,6 +105,12 @@ def _play(command: Command) -> None:
     replay(instance, solution, out, title=told, config=execution.perceived(policy.config))
     console.print(f"{told} ({seconds:.1f} s)", highlight=False)
     console.print(f"replay: {out}", highlight=False, soft_wrap=True)
+
+
+def _free_name(stem: str) -> Path:
+    """The first of stem.html, stem-2.html, stem-3.html, ... that does not exist."""
+    names = itertools.chain([f"{stem}.html"], (f"{stem}-{number}.html" for number in itertools.count(2)))
+    return next(path for path in map(Path, names) if not os.path.lexists(path))
 
 
 def _patience(instance: Instance) -> int:

@@ -158,3 +158,15 @@ def test_the_help_names_every_option(capsys, monkeypatch):
     text = capsys.readouterr().out
     for each in fields(play.Command):
         assert (f"--{each.name.replace('_', '-')}" if each.name != "file" else "FILE") in text, each.name
+
+
+def test_a_page_that_nobody_named_replaces_no_file(home, capsys):
+    (home / "own.html").write_text("mine")
+    (home / "own-2.html").symlink_to("nowhere")
+    for name in ("own-3.html", "own-4.html"):
+        played("own.scen", "--max-steps", "3")
+        assert f"replay: {name}" in capsys.readouterr().out
+        assert shown(home / name)
+    assert (home / "own.html").read_text() == "mine"
+    played("own.scen", "--max-steps", "3", "--out", "own.html")
+    assert shown(home / "own.html")
