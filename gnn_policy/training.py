@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
 from gnn_policy import checkpoint, evaluation
@@ -39,6 +40,7 @@ from gnn_policy.cores import cpu_threads
 from gnn_policy.dagger import Aggregator, Teacher, teams_side_by_side
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.finite import require_finite
+from gnn_policy.half_batches import HalfBatches
 from gnn_policy.imitation import ImitationLoss
 from gnn_policy.learning_curve import Round, draw_learning_curve
 from gnn_policy.network import DecentralizedPolicy
@@ -101,6 +103,8 @@ class Training:
         torch.manual_seed(config.seed)
         self.policy = on_device(DecentralizedPolicy(config.policy), config.device)
         self.loss = ImitationLoss(ranks.average_gradients(self.policy))
+        alone = ranks.count == 1 and self.policy.head.weight.device.type == "cpu"
+        self._halves = HalfBatches(self.policy, self.loss, config.precision, self.threads) if alone else None
         self.optimizer = torch.optim.Adam(
             self.policy.parameters(),
             lr=config.lr,
@@ -169,6 +173,8 @@ class Training:
         finally:
             torch.set_flush_denormal(False)
             aggregator.close()
+            if self._halves is not None:
+                self._halves.close()
             torch.set_num_threads(self.threads)  # and give back more than they took
             if writer is not None:
                 writer.close()
@@ -192,7 +198,10 @@ class Training:
             raise ValueError("the expert solved none of the visited states: raise expert_nodes or make cases easier")
         between = self._clock()
         lr = float(self.scheduler.get_last_lr()[0])
+        if self._halves is not None:
+            torch.set_num_threads(self._halves.threads)
         loss, accuracy, updates, samples = self._fit(number, demonstrations, batches)
+        torch.set_num_threads(self.threads)
         self.scheduler.step()
         done = self._clock()
         previous = self.history[-1] if self.history else None
@@ -234,12 +243,8 @@ class Training:
         for update, chosen in enumerate(draws):
             own = chosen[self.ranks.rank :: self.ranks.count]
             batch = batches.batch(demonstrations, own, rng).to(config.device)
-            with autocast(config.precision, self.policy.head.weight.device):
-                outcome = self.loss(batch)
-            self.optimizer.zero_grad()
-            outcome["loss_imitation"].backward()
+            losses[update], accuracies[update] = self._backward(batch)
             self.optimizer.step()
-            losses[update], accuracies[update] = outcome["loss_imitation"].item(), outcome["accuracy"].item()
             if not np.isfinite(losses[update]):
                 raise self._diverged(number, "the loss is not a finite number")
             self.progress.fitted(number, update + 1, updates, losses[: update + 1], robots)
@@ -251,6 +256,16 @@ class Training:
             raise self._diverged(number, str(damage)) from damage
         means = self.ranks.average(torch.tensor([losses.mean(), accuracies.mean()])).tolist()
         return means[0], means[1], updates, sum(map(len, draws)) * config.num_agents
+
+    def _backward(self, batch: TensorDict) -> tuple[float, float]:
+        """Set the gradients; return loss and accuracy of the batch."""
+        if self._halves is not None:
+            return self._halves.backward(batch)
+        with autocast(self.config.precision, self.policy.head.weight.device):
+            outcome = self.loss(batch)
+        self.optimizer.zero_grad()
+        outcome["loss_imitation"].backward()
+        return outcome["loss_imitation"].item(), outcome["accuracy"].item()
 
     def _require_finite(self) -> None:
         """Check the weights, the batch statistics and the optimiser's moments."""
