@@ -130,8 +130,8 @@ class DecentralizedPolicy(nn.Module):
                 f"{'with' if config.cost_to_go else 'without'} cost_to_go"
             )
         views = fov.to(self.head.weight.dtype, memory_format=torch.channels_last)
-        if config.cost_to_go and fov.dtype == torch.uint8:  # counted from -2 r within the ring
-            views[:, 3, 1:-1, 1:-1] = views[:, 3, 1:-1, 1:-1] / (2 * config.fov_radius) - 1
+        if config.cost_to_go and fov.dtype == torch.uint8:  # counted from -2 r
+            views[:, 3] = views[:, 3] / (2 * config.fov_radius) - 1
         return self.encoder(views)
 
     def decide(self, filtered: Float[Tensor, "*B F"]) -> Float[Tensor, "*B 5"]:

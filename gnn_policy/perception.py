@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnn_policy.policy_config import CommRange, CommWeights, PolicyConfig
-from mapf_env import Instance, rules
+from mapf_env import HISTORY, Instance, MapSet, Senses, States, perceive, rules
 
 
 class Perception:
@@ -55,10 +55,20 @@ class Perception:
         keep their `distances` of `rules.distance_tables`, which a policy that knows the map needs.
         """
         radius = self._config.fov_radius
-        fov = rules.observe(obstacles, positions, goals, radius)
-        if self._config.cost_to_go:
-            if distances is None:
-                distances = rules.distance_tables(obstacles, radius, goals)
-            extra = rules.observe_extra(obstacles, positions, radius, "cost_to_go", distances=distances)
-            fov = np.concatenate([fov, extra[:, :, None]], axis=2)
+        B, N = positions.shape[:2]
+        senses = Senses(fov_radius=radius, extra_channels=("cost_to_go",) if self._config.cost_to_go else ())
+        maps = MapSet(obstacles[:, radius:-radius, radius:-radius].astype(bool), radius, obstacles.dtype.name)
+        states = States(
+            maps=maps.index,
+            offsets=np.arange(B + 1) * N,
+            positions=positions.reshape(-1, 2),
+            goals=goals.reshape(-1, 2),
+            moves=np.full((B * N, HISTORY), -1, np.int8),
+            under_way=np.zeros(B * N, np.int32),
+            seeds=np.zeros(B, np.uint64),
+            times=np.zeros(B, np.int32),
+            limits=np.ones(B, np.int32),
+            comm_radius=self._radii[cases],
+        )
+        fov = perceive(states, maps, senses).fov.reshape(B, N, -1, senses.fov_side, senses.fov_side)
         return fov, rules.communication_graph(positions, self._radii[cases], weights=self._weights)

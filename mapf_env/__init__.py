@@ -15,38 +15,48 @@ import pettingzoo
 
 from mapf_env.ascii_map import parse_instance, parse_map
 from mapf_env.batched_env import BatchedEnv, Observation, Step
-from mapf_env.config import EnvConfig
+from mapf_env.config import EnvConfig, Shield
 from mapf_env.generation import Maze, Rooms, Walls, Warehouse, random_cases, random_instance, random_map, random_maps
 from mapf_env.grid_v0 import ENV_ID, GridEnv, env, parallel_env
 from mapf_env.instance import Instance
 from mapf_env.instance_set import instance_hash, load_instances, save_instances
 from mapf_env.joint_v0 import JointEnv, joint_env
 from mapf_env.movingai import load_map, load_scen, save_map, save_scen
+from mapf_env.perception import Bag, MapSet, States, perceive
 from mapf_env.pogema_maps import PogemaMap, load_pogema_maps, parse_pogema_map
 from mapf_env.render import animate, draw
 from mapf_env.replay import Scene, replay, replay_scenes
 from mapf_env.rewards import SCHEMES, Rewards
 from mapf_env.rules import Edges, communication_edges, communication_graph
+from mapf_env.senses import HISTORY, CommRange, CommWeights, Senses
 from mapf_env.solution import MOVES, Action, Conflict, Solution
 
 __all__ = [
+    "HISTORY",
     "MOVES",
     "SCHEMES",
     "Action",
+    "Bag",
     "BatchedEnv",
+    "CommRange",
+    "CommWeights",
     "Conflict",
     "Edges",
     "EnvConfig",
     "GridEnv",
     "Instance",
     "JointEnv",
+    "MapSet",
     "Maze",
     "Observation",
     "PogemaMap",
     "Rewards",
     "Rooms",
     "Scene",
+    "Senses",
+    "Shield",
     "Solution",
+    "States",
     "Step",
     "Walls",
     "Warehouse",
@@ -65,6 +75,7 @@ __all__ = [
     "parse_instance",
     "parse_map",
     "parse_pogema_map",
+    "perceive",
     "random_cases",
     "random_instance",
     "random_map",

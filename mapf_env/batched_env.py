@@ -3,35 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple, fields
-from typing import Any, NamedTuple
+from dataclasses import fields
+from typing import Any, Generic, Literal, NamedTuple, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 
 from mapf_env import _native, arguments, rules
-from mapf_env.config import CHANNELS, EnvConfig
+from mapf_env.config import EnvConfig
 from mapf_env.instance import Instance
 from mapf_env.instance_source import InstanceSource
+from mapf_env.perception import Bag, States
 from mapf_env.team_state import TeamState
 
 _FLOAT = np.dtype(np.float32)
 
 
 class Observation(NamedTuple):
-    """What the robots of B teams perceive; C = 3 + extra channels."""
+    """What the robots of B teams perceive; C, K and D follow from the settings."""
 
     fov: npt.NDArray[Any]
     """(B, N, C, F, F) fields of view."""
     graph: npt.NDArray[np.float32]
     """(B, N, N) communication graph; row i says whom robot i hears."""
+    scalars: npt.NDArray[np.float32]
+    """(B, N, K) what each robot knows about itself, by the setting `robot_features`."""
+    edge_attr: npt.NDArray[np.float32]
+    """(B, N, N, D) what robot i knows about each robot j that it hears, by `edge_features`; 0 if it does not hear j."""
 
 
-class Step(NamedTuple):
+Seen = TypeVar("Seen", bound=Observation | None)
+
+
+class Step(NamedTuple, Generic[Seen]):
     """The outcome of one joint step of B teams."""
 
-    observation: Observation
+    observation: Seen
+    """What the robots perceive after the step; None after a step without observation."""
     rewards: npt.NDArray[np.float32]
     """(B, N) by default 0 for a robot that is on its goal after the step, else -1.
 
@@ -92,8 +101,11 @@ class BatchedEnv:
             raise ValueError(f"autoreset must be one of {modes}, got {autoreset!r}") from None
         self.config = config = EnvConfig(**settings)
         self._source = InstanceSource(config, cases, fill)
-        self._fov_shape = (num_envs, config.num_agents, config.num_channels, config.fov_side, config.fov_side)
-        self._graph_shape = (num_envs, config.num_agents, config.num_agents)
+        teams = (num_envs, config.num_agents)
+        self._fov_shape = (*teams, config.num_channels, config.fov_side, config.fov_side)
+        self._graph_shape = (*teams, config.num_agents)
+        self._scalars_shape = (*teams, config.num_robot_features)
+        self._edge_attr_shape = (*teams, config.num_agents, config.num_edge_features)
         self._dtype = np.dtype(config.dtype)
         self._state = TeamState.empty(num_envs, config)
         self._bind()
@@ -114,22 +126,8 @@ class BatchedEnv:
         return other
 
     def _bind(self) -> None:
-        config = self.config
-        stepper = _native.StepperFloat32 if config.dtype == "float32" else _native.StepperUint8
-        self.stepper = stepper(
-            self._state,
-            pad=config.fov_radius,
-            pibt=config.shield == "pibt",
-            lifelong=config.task == "lifelong",
-            max_cycles=config.max_cycles,
-            weights=int(config.comm_weights == "distance"),
-            message_loss=config.message_loss,
-            comm_radius=config.comm_radius,
-            connected=config.comm_range == "connected",
-            extras=[CHANNELS.index(channel) for channel in config.extra_channels],
-            rewards=list(astuple(config.rewards)),
-            threads=self.threads,
-        )
+        stepper = _native.StepperFloat32 if self.config.dtype == "float32" else _native.StepperUint8
+        self.stepper = stepper(self._state, self.config, self.threads)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "stepper"}
@@ -160,6 +158,31 @@ class BatchedEnv:
         return self._state.goals.copy()
 
     @property
+    def moves(self) -> npt.NDArray[np.int8]:
+        """(B, N, HISTORY) the last executed moves, newest first; -1 before the start; a copy."""
+        return self._state.moves.copy()
+
+    @property
+    def under_way(self) -> npt.NDArray[np.int32]:
+        """(B, N) steps since the robot was on its goal, or since reset; a copy."""
+        return self._state.under_way.copy()
+
+    @property
+    def seeds(self) -> npt.NDArray[np.uint64]:
+        """(B,) the seeds of the episodes; a copy."""
+        return self._state.seeds.copy()
+
+    @property
+    def team_sizes(self) -> npt.NDArray[np.int32]:
+        """(B,) how many robots are there; a copy."""
+        return self._state.team_sizes.copy()
+
+    @property
+    def max_cycles(self) -> npt.NDArray[np.int32]:
+        """(B,) steps after which each team's episode is truncated; a copy."""
+        return self._state.max_cycles.copy()
+
+    @property
     def times(self) -> npt.NDArray[np.int64]:
         """(B,) steps since each team's reset; a copy."""
         return self._state.times.copy()
@@ -185,7 +208,36 @@ class BatchedEnv:
 
     def buffers(self) -> Observation:
         """Memory for observations, to be given as `out`."""
-        return Observation(np.empty(self._fov_shape, self._dtype), np.empty(self._graph_shape, _FLOAT))
+        return Observation(
+            np.empty(self._fov_shape, self._dtype),
+            np.empty(self._graph_shape, _FLOAT),
+            np.empty(self._scalars_shape, _FLOAT),
+            np.empty(self._edge_attr_shape, _FLOAT),
+        )
+
+    @overload
+    def reset(
+        self,
+        seed: int | Sequence[int] | None = None,
+        *,
+        instances: Sequence[Instance] | None = None,
+        mask: npt.NDArray[np.bool_] | None = None,
+        max_cycles: int | Sequence[int] | None = None,
+        out: Observation | None = None,
+        observe: Literal[True] = True,
+    ) -> Observation: ...
+
+    @overload
+    def reset(
+        self,
+        seed: int | Sequence[int] | None = None,
+        *,
+        instances: Sequence[Instance] | None = None,
+        mask: npt.NDArray[np.bool_] | None = None,
+        max_cycles: int | Sequence[int] | None = None,
+        out: None = None,
+        observe: Literal[False],
+    ) -> None: ...
 
     def reset(
         self,
@@ -193,8 +245,10 @@ class BatchedEnv:
         *,
         instances: Sequence[Instance] | None = None,
         mask: npt.NDArray[np.bool_] | None = None,
+        max_cycles: int | Sequence[int] | None = None,
         out: Observation | None = None,
-    ) -> Observation:
+        observe: bool = True,
+    ) -> Observation | None:
         """Begin new episodes and return what the robots perceive.
 
         Args:
@@ -203,22 +257,31 @@ class BatchedEnv:
                 seed).
             instances: One instance for each environment that is reset, in place of random ones.
             mask: (B,) which environments begin anew; all if not given. The others go on undisturbed.
+            max_cycles: Steps after which these episodes are truncated, one number or one for each of the B
+                environments; by default the setting of that name.
             out: Where to write the observation of all environments, as for `step`.
+            observe: False writes no observation and returns None, for loops that use `bag`.
 
         Raises:
             ValueError: If a length or shape does not fit, or an instance is of another size than the environment;
                 the environments are then as they were.
             TypeError: If a seed is no integer, an instance none, or the memory of another dtype.
         """
+        arguments.flag(observe, "observe")
         chosen = np.arange(self.num_envs) if mask is None else np.flatnonzero(self._checked_mask(mask))
         if out is not None:
             self._write_observation(out, np.zeros(self.num_envs, np.bool_))  # nothing, if there is room for it
-        self._begin(chosen, None if seed is None else self._checked_seeds(seed)[chosen], instances)
+        limits = None if max_cycles is None else self._checked_limits(max_cycles)[chosen]
+        self._begin(chosen, None if seed is None else self._checked_seeds(seed)[chosen], instances, limits)
         self._state.replaced[chosen] = self._state.arrived[chosen] = False
-        return self._observe(out)
+        return self._observe(out) if observe else None
 
     def _begin(
-        self, chosen: npt.NDArray[np.intp], streams: npt.NDArray[np.uint64] | None, instances: Sequence[Instance] | None
+        self,
+        chosen: npt.NDArray[np.intp],
+        streams: npt.NDArray[np.uint64] | None = None,
+        instances: Sequence[Instance] | None = None,
+        limits: npt.NDArray[np.int32] | None = None,
     ) -> None:
         state = self._state
         episodes = state.episodes[chosen] if streams is None else np.zeros_like(chosen, np.uint64)
@@ -230,10 +293,20 @@ class BatchedEnv:
         problems = self._source.draw(seeds) if instances is None else self._source.stack(instances, "instances")
         if len(problems.grids) != len(chosen):
             raise ValueError(f"{len(problems.grids)} instances for {len(chosen)} environments: give one for each")
-        self.stepper.begin(chosen, seeds, *problems)
+        if limits is None:
+            limits = np.full(len(chosen), self.config.max_cycles, np.int32)
+        self.stepper.begin(chosen, seeds, limits, *problems)
         state.streams[chosen], state.episodes[chosen] = streams, episodes + np.uint64(1)
 
-    def step(self, actions: npt.ArrayLike, out: Observation | None = None) -> Step:
+    @overload
+    def step(
+        self, actions: npt.ArrayLike, out: Observation | None = None, *, observe: Literal[True] = True
+    ) -> Step[Observation]: ...
+
+    @overload
+    def step(self, actions: npt.ArrayLike, out: None = None, *, observe: Literal[False]) -> Step[None]: ...
+
+    def step(self, actions: npt.ArrayLike, out: Observation | None = None, *, observe: bool = True) -> Step[Any]:
         """Shield and execute the joint actions (B, N), integers 0..4.
 
         Args:
@@ -241,13 +314,17 @@ class BatchedEnv:
                 them, (B, N, 5), for example logits: the greatest is wanted most.
             out: Where to write the observation, NumPy arrays or torch tensors on the CPU shaped as in `buffers()`; it
                 is what is returned then. Fresh arrays if not given.
+            observe: False writes no observation, for loops that use `bag`; teams that have ended are then left as they
+                are, whatever their actions.
 
         Raises:
             ValueError: If the shape is wrong or an action is out of range.
             TypeError: If the actions are not integers, or the memory is of another dtype.
-            RuntimeError: Before the first reset, or if a team has ended and was not reset.
+            RuntimeError: Before the first reset, or, if the step is observed, if a team has ended and was not reset.
         """
-        observation = self.buffers() if out is None else out
+        if not arguments.flag(observe, "observe") and out is not None:
+            raise ValueError("a step without observation needs no memory for it: leave out the argument out")
+        observation = (self.buffers() if out is None else out) if observe else None
         final = self.advance(arguments.numbers(actions, "actions"), observation)
         state = self._state
         return Step(
@@ -260,10 +337,10 @@ class BatchedEnv:
             final,
         )
 
-    def advance(self, actions: npt.NDArray[Any], out: Observation) -> Observation | None:
+    def advance(self, actions: npt.NDArray[Any], out: Observation | None) -> Observation | None:
         """`step` without copies of the outcome, which stands in the state; returns the final observation."""
         if self.autoreset is AutoresetMode.DISABLED:
-            self._execute(actions, out, skip_ended=False)
+            self._execute(actions, out, skip_ended=out is None and self.began)
             return None
         state = self._state
         due = state.ended.copy()
@@ -271,14 +348,15 @@ class BatchedEnv:
         final = None
         if self.autoreset is AutoresetMode.SAME_STEP:
             due = state.ended.copy()
-            if due.any():
+            if due.any() and out is not None:
                 final = Observation(*(np.asarray(part)[due] for part in out))
         if due.any():
-            self._begin(np.flatnonzero(due), None, None)
-            self._write_observation(out, due)
+            self._begin(np.flatnonzero(due))
+            if out is not None:
+                self._write_observation(out, due)
         return final
 
-    def _execute(self, actions: npt.NDArray[Any], out: Observation, *, skip_ended: bool) -> None:
+    def _execute(self, actions: npt.NDArray[Any], out: Observation | None, *, skip_ended: bool) -> None:
         step: Callable[..., None]
         if actions.ndim == 3:
             step, wanted = self.stepper.step_by_values, rules.as_values(actions)
@@ -286,10 +364,7 @@ class BatchedEnv:
             step, wanted = self.stepper.step, rules.as_actions(actions)
         else:
             raise ValueError(f"actions must have shape ({self.num_envs}, {self.num_agents}), got {actions.shape}")
-        try:
-            step(wanted, *out, skip_ended)
-        except TypeError:
-            raise self._no_memory() from None
+        step(wanted, out, skip_ended)
 
     def observe(self, out: Observation | None = None) -> Observation:
         """What the robots perceive now.
@@ -307,15 +382,40 @@ class BatchedEnv:
         return observation
 
     def _write_observation(self, out: Observation, chosen: npt.NDArray[np.bool_] | None) -> None:
-        try:
-            self.stepper.observe(*out, chosen)
-        except TypeError:
-            raise self._no_memory() from None
+        self.stepper.observe(out, chosen)
 
-    def _no_memory(self) -> TypeError:
-        return TypeError(
-            f"out must be an Observation of contiguous memory as buffers() makes it: {self._dtype} for the views and "
-            "float32 for the graph"
+    def bag(self, mask: npt.NDArray[np.bool_] | None = None) -> Bag:
+        """What the robots of the teams that are under way perceive, as one bag; `Bag.team` is the environment.
+
+        A team is under way from its reset to its end.
+
+        Args:
+            mask: (B,) take only these of them.
+        """
+        return Bag(*self.stepper.bag(None if mask is None else self._checked_mask(mask)))
+
+    def states(self, mask: npt.NDArray[np.bool_] | None = None) -> States:
+        """The joint states of all teams, or of those of `mask` (B,), as copies; `States.maps` is the environment.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        if not self.began:
+            raise RuntimeError("there are no states before the first reset: call reset()")
+        chosen = np.arange(self.num_envs) if mask is None else np.flatnonzero(self._checked_mask(mask))
+        state, sizes = self._state, self._state.team_sizes[chosen]
+        robots = np.arange(self.num_agents) < sizes[:, None]
+        return States(
+            maps=chosen.astype(np.int32),
+            offsets=np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes, dtype=np.int64)]),
+            positions=state.positions[chosen][robots],
+            goals=state.goals[chosen][robots],
+            moves=state.moves[chosen][robots],
+            under_way=state.under_way[chosen][robots],
+            seeds=state.seeds[chosen],
+            times=state.times[chosen].astype(np.int32),
+            limits=state.max_cycles[chosen],
+            comm_radius=state.comm_radius[chosen],
         )
 
     def edges(self, graph: npt.NDArray[np.float32]) -> rules.Edges:
@@ -340,6 +440,13 @@ class BatchedEnv:
         if len(seeds) != self.num_envs or not all(0 <= each < 2**64 for each in seeds):
             raise ValueError(f"give one non-negative seed or {self.num_envs} of them, below 2**64, got {seed!r}")
         return np.array(seeds, np.uint64)
+
+    def _checked_limits(self, max_cycles: int | Sequence[int]) -> npt.NDArray[np.int32]:
+        given = max_cycles if isinstance(max_cycles, Sequence | np.ndarray) else [max_cycles] * self.num_envs
+        limits = [arguments.integer(each, "max_cycles", 1, arguments.MOST_INT) for each in given]
+        if len(limits) != self.num_envs:
+            raise ValueError(f"give one max_cycles or {self.num_envs} of them, got {len(limits)}")
+        return np.array(limits, np.int32)
 
     def _checked_mask(self, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
         array = arguments.array(mask, "mask")

@@ -23,7 +23,8 @@ ENV_ID = "mapf/grid-v0"
 class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
     """A team of robots with local views and local communication, stepped under a collision shield.
 
-    Every agent observes `{"fov": (C, F, F), "graph": (N,)}`: its field of view and its row of the communication graph.
+    Every agent observes `{"fov": (C, F, F), "graph": (N,)}`: its field of view and its row of the communication graph;
+    with `robot_features` also "scalars" (K,), with `edge_features` also "edge_attr" (N, D).
     All agents live until the joint end: terminated once all are on their goals at the same time, truncated after
     `max_cycles` steps. Infos carry `action_mask` (5,), `replaced` (the shield changed the action) and `on_goal`, in
     lifelong tasks `arrived` too.
@@ -68,11 +69,12 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         N, (H, W) = config.num_agents, (config.height, config.width)
         self.possible_agents = [f"agent_{i}" for i in range(N)]
         self.agents: list[str] = []
-        fov, graph = fov_space(config), spaces.Box(0.0, 1.0, (N,), np.float32)
-        both = spaces.Dict({"fov": fov, "graph": graph})
+        parts = observation_spaces(config)
+        self._keys = tuple(parts)
         moves = spaces.Box(-np.inf, np.inf, (5,), np.float32) if preferences else spaces.Discrete(5)
         self.observation_spaces = {
-            agent: copy.deepcopy(both if observation == "dict" else fov) for agent in self.possible_agents
+            agent: copy.deepcopy(spaces.Dict(parts) if observation == "dict" else parts["fov"])
+            for agent in self.possible_agents
         }
         self.action_spaces = {agent: copy.deepcopy(moves) for agent in self.possible_agents}
         self.state_space = spaces.Box(0.0, 1.0, (3, H, W), np.float32)
@@ -161,7 +163,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self._batch = begun(self._batch, self.config, seed, instance, buffers)
         self.agents = list(self.possible_agents)
         if reused is None:
-            observations, infos, memory = self._fresh(*buffers)
+            observations, infos, memory = self._fresh(buffers)
         else:
             (observations, *_, infos), memory = reused.returned, reused.memory
         self._batch.stepper.outcome_by_agent(memory, self.agents, {}, {}, {}, infos)
@@ -189,7 +191,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         batch, reused = self._batch, self._reused
         if reused is None:
             buffers = batch.buffers()
-            observations, infos, memory = self._fresh(*buffers)
+            observations, infos, memory = self._fresh(buffers)
             rewards, terminated, truncated = {}, {}, {}
         else:
             buffers, memory = reused.buffers, reused.memory
@@ -217,17 +219,18 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
     def close(self) -> None:
         """Nothing to release."""
 
-    def _fresh(
-        self, fov: npt.NDArray[Any], graph: npt.NDArray[np.float32]
-    ) -> tuple[dict[str, Any], dict[str, Any], Any]:
-        """Observations and infos by agent, whose arrays are rows of (1, N, C, F, F), (1, N, N) and masks (N, 5).
+    def _fresh(self, buffers: Observation) -> tuple[dict[str, Any], dict[str, Any], Any]:
+        """Observations and infos by agent, whose arrays are rows of the buffers (1, N, ...) and of masks (N, 5).
 
         And these as memory for the stepper, of its dtype.
         """
         agents, rows = self.possible_agents, _native.rows_by_agent
         masks = np.empty(self._masks_shape, np.int8)
-        names, columns = (("fov", "graph"), (fov[0], graph[0])) if self._observation == "dict" else ((), (fov[0],))
-        return rows(agents, names, columns), rows(agents, ("action_mask",), (masks,)), self._memory(fov, graph, masks)
+        if self._observation == "dict":
+            names, columns = self._keys, tuple([getattr(buffers, key)[0] for key in self._keys])
+        else:
+            names, columns = (), (buffers.fov[0],)
+        return rows(agents, names, columns), rows(agents, ("action_mask",), (masks,)), self._memory(buffers, masks)
 
     def _checked(self, actions: dict[str, Any]) -> list[Any]:
         """The actions in the order of agents, or what is wrong with them."""
@@ -244,20 +247,26 @@ class _Reused:
 
     def __init__(self, env: GridEnv) -> None:
         self.buffers = env._batch.buffers()
-        observations, infos, self.memory = env._fresh(*self.buffers)
+        observations, infos, self.memory = env._fresh(self.buffers)
         self.returned: tuple[dict[str, Any], ...] = (observations, {}, {}, {}, infos)
 
 
-def fov_space(config: EnvConfig) -> spaces.Box:
-    """The values of a robot's view (C, F, F)."""
-    low, high = np.zeros(config.num_channels), np.ones(config.num_channels)
-    if "cost_to_go" in config.extra_channels:
-        channel = 3 + config.extra_channels.index("cost_to_go")
-        low[channel], high[channel] = (0, 4 * config.fov_radius) if config.dtype == "uint8" else (-1, 1)
+def observation_spaces(config: EnvConfig) -> dict[str, Any]:
+    """The values of what one robot observes, by key: fov (C, F, F), graph (N,), and scalars and edge_attr if any."""
+    low, high, unit = config.channel_low, config.channel_high, config.channel_unit
+    if config.dtype == "uint8":
+        low, high = np.zeros_like(low), (high - low) * unit
+    N, dtype = config.num_agents, np.uint8 if config.dtype == "uint8" else np.float32
     shape = (config.num_channels, config.fov_side, config.fov_side)
-    dtype = np.uint8 if config.dtype == "uint8" else np.float32
     bounds = [np.broadcast_to(bound[:, None, None], shape).astype(dtype) for bound in (low, high)]
-    return spaces.Box(bounds[0], bounds[1], shape, dtype)
+    found = {"fov": spaces.Box(bounds[0], bounds[1], shape, dtype), "graph": spaces.Box(0.0, 1.0, (N,), np.float32)}
+    if config.num_robot_features:
+        low, high = config.robot_feature_bounds
+        found["scalars"] = spaces.Box(low, high, dtype=np.float32)
+    if config.num_edge_features:
+        low, high = (np.tile(bound, (N, 1)) for bound in config.edge_feature_bounds)
+        found["edge_attr"] = spaces.Box(low, high, dtype=np.float32)
+    return found
 
 
 def begun(

@@ -12,13 +12,14 @@ from gymnasium import spaces
 from mapf_env import arguments
 from mapf_env.batched_env import BatchedEnv, Observation
 from mapf_env.config import EnvConfig
-from mapf_env.grid_v0 import begun, fov_space, instance_asked_for
+from mapf_env.grid_v0 import begun, instance_asked_for, observation_spaces
 from mapf_env.pixels import RENDER_MODES, RenderMode, Screen
 
 
 class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
     """All robots decided by one agent: it observes `{"fov": (N, C, F, F), "graph": (N, N)}` and acts by N moves.
 
+    With `robot_features` it also observes "scalars" (N, K), with `edge_features` "edge_attr" (N, N, D).
     The reward is the sum of the robots' rewards. Infos carry `action_mask` (N, 5), `replaced` (N,) and `on_goal` (N,),
     in lifelong tasks `arrived` (N,) too.
 
@@ -34,14 +35,10 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
         self._batch = BatchedEnv(1, **settings)
         self.render_mode = render_mode
         self._screen = Screen(render_mode, self.metadata["render_fps"])
-        N, view = config.num_agents, fov_space(config)
-        low, high = (np.broadcast_to(bound, (N, *view.shape)) for bound in (view.low, view.high))
-        self.observation_space = spaces.Dict(
-            {
-                "fov": spaces.Box(low, high, dtype=view.dtype.type),  # pyright: ignore[reportOptionalMemberAccess]
-                "graph": spaces.Box(0.0, 1.0, (N, N), np.float32),
-            }
-        )
+        N = config.num_agents
+        parts = observation_spaces(config)
+        self._keys = tuple(parts)
+        self.observation_space = spaces.Dict({key: _of_all(part, N) for key, part in parts.items()})
         self.action_space = spaces.MultiDiscrete([5] * N)
 
     def reset(
@@ -91,7 +88,7 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
             self.render()
 
     def _seen(self, observation: Observation) -> dict[str, npt.NDArray[Any]]:
-        return {"fov": observation.fov[0], "graph": observation.graph[0]}
+        return {key: getattr(observation, key)[0] for key in self._keys}
 
     def _infos(self, replaced: npt.NDArray[np.bool_], arrived: npt.NDArray[np.bool_]) -> dict[str, Any]:
         infos = {
@@ -100,6 +97,12 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
             "on_goal": self._batch.on_goal()[0],
         }
         return infos | {"arrived": arrived} if self.config.task == "lifelong" else infos
+
+
+def _of_all(space: spaces.Box, num_agents: int) -> spaces.Box:
+    """The space of what `num_agents` robots observe, each of them in `space`."""
+    low, high = (np.broadcast_to(bound, (num_agents, *space.shape)) for bound in (space.low, space.high))
+    return spaces.Box(low, high, dtype=space.dtype.type)  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def joint_env(**settings: Any) -> JointEnv:

@@ -7,13 +7,13 @@ ValueError, or TypeError where cells or actions are no integers.
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from mapf_env import _native, arguments
-from mapf_env.config import CHANNELS, Channel
+from mapf_env.senses import CommWeights
 
 Positions = npt.NDArray[np.int32]
 Bordered = npt.NDArray[Any]
@@ -62,48 +62,19 @@ def distance_tables(obstacles: Bordered, fov_radius: int, goals: npt.ArrayLike) 
     return _native.distance_tables(obstacles, fov_radius, _cells(goals, "goals"))
 
 
-def observe_extra(
-    obstacles: Bordered,
-    positions: npt.ArrayLike,
-    fov_radius: int,
-    channel: Channel,
-    *,
-    goals: npt.ArrayLike | None = None,
-    previous: npt.ArrayLike | None = None,
-    distances: npt.NDArray[np.uint16] | None = None,
-) -> npt.NDArray[Any]:
-    """A channel beyond the paper, (B, N, F, F), inside the same ring of zeros.
-
-    cost_to_go: how many steps more than from here it is to the own goal, from each cell in view, by the `distances` of
-    `distance_tables`; within -2 r..2 r for a fov_radius of r, and 2 r where there is no way. As float32 that is divided
-    by 2 r, so -1..1 and negative where the goal is closer; as uint8 it is counted from -2 r, so 0..4 r.
-    other_goals: 1 on the `goals` of other robots.
-    previous_positions: 1 where robots stood one step before, `previous` (B, N, 2).
-    """
-    needed = {"cost_to_go": distances, "other_goals": goals, "previous_positions": previous}[channel]
-    if needed is None:
-        raise ValueError(f"the channel {channel} needs distances, goals or previous, whichever it shows")
-    side, positions = 2 * fov_radius + 3, _cells(positions)
-    out = np.empty((*positions.shape[:2], side, side), obstacles.dtype)
-    tables = np.zeros((0, 0, 0), np.uint16) if distances is None else distances
-    cells = np.zeros((0, 0, 2), np.int32) if channel == "cost_to_go" else _cells(needed, channel)
-    _native.observe_channel(obstacles, fov_radius, positions, cells, tables, fov_radius, CHANNELS.index(channel), out)
-    return out
-
-
 def communication_graph(
     positions: npt.ArrayLike,
     radius: float | npt.NDArray[np.float64],
     out: npt.NDArray[np.float32] | None = None,
     *,
-    weights: Literal["binary", "distance"] = "binary",
+    weights: CommWeights = "binary",
 ) -> npt.NDArray[np.float32]:
     """Who hears whom: weights (B, N, N), or (N, N) for positions (N, 2); `radius` is one number or one for each team.
 
     1, or with `weights="distance"` 1 / distance, where two different robots are closer than `radius` cells (Euclidean,
     strictly, as in the released code), else 0. `out` is memory (B, N, N) to write them into, for positions (B, N, 2).
     """
-    arguments.choice(weights, ("binary", "distance"), "weights")
+    arguments.choice(weights, get_args(CommWeights), "weights")
     found = arguments.array(positions, "positions")
     single = found.ndim == 2
     cells = arguments.cells(found[None] if single else found, "positions", "(B, N, 2)", " or (N, 2)")

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mapf_env.config import EnvConfig
+from mapf_env.senses import HISTORY
 
 
 @dataclass(eq=False, slots=True)
@@ -31,8 +32,8 @@ class TeamState:
     """(B, N, 2)"""
     goals: npt.NDArray[np.int32]
     """(B, N, 2)"""
-    previous: npt.NDArray[np.int32]
-    """(B, N, 2) the positions one step before; at reset the positions."""
+    moves: npt.NDArray[np.int8]
+    """(B, N, HISTORY) the last executed moves, newest first; -1 before the start."""
     under_way: npt.NDArray[np.int32]
     """(B, N) steps since the robot was on its goal, or since reset."""
     arrivals: npt.NDArray[np.int32]
@@ -45,6 +46,8 @@ class TeamState:
     """(B, N, size) steps to the goal; empty unless they are needed."""
     times: npt.NDArray[np.int64]
     """(B,) steps since reset."""
+    max_cycles: npt.NDArray[np.int32]
+    """(B,) steps after which the episode is truncated."""
     started: npt.NDArray[np.bool_]
     """(B,) the environment has been reset."""
     ended: npt.NDArray[np.bool_]
@@ -79,13 +82,14 @@ class TeamState:
             team_sizes=np.zeros(B, np.int32),
             positions=np.zeros((B, N, 2), np.int32),
             goals=np.zeros((B, N, 2), np.int32),
-            previous=np.zeros((B, N, 2), np.int32),
+            moves=np.full((B, N, HISTORY), -1, np.int8),
             under_way=np.zeros((B, N), np.int32),
             arrivals=np.zeros((B, N), np.int32),
             comm_radius=np.full(B, config.comm_radius, np.float64),
             regions=np.zeros((B, size if config.task == "lifelong" else 0), np.int32),
             distances=np.zeros((B, N, size if config.needs_distances else 0), np.uint16),
             times=np.zeros(B, np.int64),
+            max_cycles=np.full(B, config.max_cycles, np.int32),
             started=np.zeros(B, np.bool_),
             ended=np.ones(B, np.bool_),
             rewards=np.zeros((B, N), np.float32),

@@ -8,7 +8,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 import oracles
-from mapf_env import SCHEMES, Instance, Rewards
+from mapf_env import HISTORY, SCHEMES, Instance, Rewards
+from mapf_env.senses import channels, edge_features, robot_features
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -73,10 +74,13 @@ def settings(draw: st.DrawFn, max_side: int = 7, max_agents: int = 8) -> dict[st
 @st.composite
 def all_settings(draw: st.DrawFn) -> dict[str, Any]:
     """Settings of an environment with every option at once."""
-    names = ["cost_to_go", "other_goals", "previous_positions"]
+    names = [name for name in channels() if name not in ("obstacles", "goal", "robots")]
     parts = st.sampled_from([0.0, -1.0, 0.5])
     return draw(settings(max_side=6, max_agents=6)) | {
-        "extra_channels": tuple(draw(st.permutations(names))[: draw(st.integers(0, 3))]),
+        "extra_channels": some_of(draw, names),
+        "robot_features": some_of(draw, list(robot_features())),
+        "edge_features": some_of(draw, list(edge_features())),
+        "memory": draw(st.integers(1, HISTORY)),
         "comm_radius": draw(st.sampled_from([1.0, 2.5, float("inf")])),
         "comm_range": draw(st.sampled_from(["fixed", "connected"])),
         "comm_weights": draw(st.sampled_from(["binary", "distance"])),
@@ -85,3 +89,8 @@ def all_settings(draw: st.DrawFn) -> dict[str, Any]:
         "task": draw(st.sampled_from(["one_shot", "lifelong"])),
         "reward": draw(st.one_of(st.sampled_from(sorted(SCHEMES)), st.builds(Rewards, *[parts] * 6))),
     }
+
+
+def some_of(draw: st.DrawFn, names: list[str]) -> tuple[str, ...]:
+    """Up to three of the names, in any order."""
+    return tuple(draw(st.permutations(names))[: draw(st.integers(0, 3))])

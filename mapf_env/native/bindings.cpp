@@ -16,6 +16,7 @@
 #include "mapf_env/native/grid.hpp"
 #include "mapf_env/native/graph.hpp"
 #include "mapf_env/native/observe.hpp"
+#include "mapf_env/native/perceive.hpp"
 #include "mapf_env/native/pibt_shield.hpp"
 #include "mapf_env/native/shield.hpp"
 #include "mapf_env/native/stepper.hpp"
@@ -248,44 +249,6 @@ double connecting_radius(In<std::int32_t, 2> positions, double radius) {
 }
 
 template <class T>
-void observe_channel(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, In<std::int32_t, 3> cells,
-                     In<mapf::Distance, 3> distances, int radius, int channel, InOut<T, 4> out) {
-    const auto layout = layout_of(obstacles, pad);
-    const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1), side = 2 * radius + 3;
-    const std::size_t size = layout.size();
-    require(radius >= 1 && pad >= radius, "obstacles need a border of at least the field of view's radius");
-    require_on_map(positions, layout, num_envs, "positions");
-    require(out.shape(0) == num_envs && out.shape(1) == num_agents && out.shape(2) == side && out.shape(3) == side,
-            "out must have shape (B, N, 2 * radius + 3, 2 * radius + 3)");
-    const auto kind = static_cast<mapf::Channel>(channel);
-    if (kind == mapf::Channel::cost_to_go) {
-        require(distances.shape(0) == num_envs && distances.shape(1) == num_agents && distances.shape(2) == size,
-                "distances must have shape (B, N, size)");
-    } else {
-        require_on_map(cells, layout, num_envs, "cells");
-        require(cells.shape(1) == num_agents, "give one cell for each agent");
-    }
-    std::vector<T> marks(size, T{0});
-    const int n = static_cast<int>(num_agents);
-    for (std::size_t b = 0; b < num_envs; ++b) {
-        const auto* here = positions.data() + b * num_agents * 2;
-        const auto* there = cells.data() + b * num_agents * 2;
-        T* plane = out.data() + b * num_agents * side * side;
-        switch (kind) {
-            case mapf::Channel::cost_to_go:
-                mapf::observe_cost_to_go(layout, distances.data() + b * num_agents * size, here, n, radius, 1, plane);
-                break;
-            case mapf::Channel::other_goals:
-                mapf::observe_other_goals(layout, here, there, n, radius, 1, marks.data(), plane);
-                break;
-            case mapf::Channel::previous_positions:
-                mapf::observe_previous_positions(layout, here, there, n, radius, 1, marks.data(), plane);
-                break;
-        }
-    }
-}
-
-template <class T>
 Out<mapf::Distance> distance_tables(In<T, 3> obstacles, int pad, In<std::int32_t, 3> goals) {
     const auto layout = layout_of(obstacles, pad);
     const std::size_t num_envs = obstacles.shape(0), num_agents = goals.shape(1), size = layout.size();
@@ -376,8 +339,6 @@ void define_for_dtype(nb::module_& m) {
           "(B, N) int8 actions that the paper's collision shield lets through; ties are drawn by seed and time.");
     m.def("action_mask", &action_mask<T>, "obstacles"_a, "pad"_a, "positions"_a,
           "(B, N, 5) int8, 1 for each action that neither leaves the map nor enters an obstacle.");
-    m.def("observe_channel", &observe_channel<T>, "obstacles"_a, "pad"_a, "positions"_a, "cells"_a, "distances"_a,
-          "radius"_a, "channel"_a, "out"_a.noconvert(), "Write a channel beyond the paper into out (B, N, side, side).");
     m.def("distance_tables", &distance_tables<T>, "obstacles"_a, "pad"_a, "goals"_a,
           "(B, N, size) uint16 steps from each cell of the bordered map to each goal; 65535 where there is no way.");
     m.def("pibt_shield", &pibt_shield<T>, "obstacles"_a, "pad"_a, "positions"_a, "values"_a, "actions"_a,
@@ -411,6 +372,7 @@ NB_MODULE(_native, m) {
           "The least radius * 1.1^k at which the robots (N, 2) are connected.");
     m.def("move", &move, "positions"_a, "actions"_a, "(B, N, 2) int32 positions after the actions (B, N) int64.");
     m.def("mix", &mix, "seeds"_a, "counters"_a, "(B,) uint64 hash of a seed and a counter.");
+    mapf::define_perceive(m);
     mapf::define_stepper(m);
     define_for_dtype<float>(m);
     define_for_dtype<std::uint8_t>(m);

@@ -29,6 +29,18 @@ MAPF_WIDE void write_rows(const float* rows, const float* cols, int num_agents, 
     }
 }
 
+// The least squared distance that is too far to hear. Squared distances are whole numbers, exact in float up to maps of
+// 2896 x 2896 cells.
+float least_too_far(double radius) {
+    double nearest = std::floor(radius * radius);
+    if (std::sqrt(nearest) < radius) ++nearest;
+    return static_cast<float>(nearest);
+}
+
+bool is_lost(std::uint64_t key, int receiver, int sender, double loss) {
+    return uniform(mix(mix(key, receiver), sender)) < loss;
+}
+
 }  // namespace
 
 void communication_graph(const std::int32_t* positions, int num_agents, double radius, Weights weights, int stride,
@@ -39,18 +51,46 @@ void communication_graph(const std::int32_t* positions, int num_agents, double r
         rows[i] = static_cast<float>(positions[2 * i]);
         cols[i] = static_cast<float>(positions[2 * i + 1]);
     }
-    // Squared distances are whole numbers, exact in float up to maps of 2896 x 2896 cells; `limit` is the least of them
-    // that is too far.
-    double nearest = std::floor(radius * radius);
-    if (std::sqrt(nearest) < radius) ++nearest;
-    write_rows(rows.data(), cols.data(), num_agents, static_cast<float>(nearest), weights == Weights::binary, stride,
-               out);
+    write_rows(rows.data(), cols.data(), num_agents, least_too_far(radius), weights == Weights::binary, stride, out);
+}
+
+void find_edges(const Layout& layout, const std::int32_t* positions, int num_agents, double radius, Weights weights,
+                double loss, std::uint64_t key, std::vector<int>& standing, std::vector<Edge>& edges) {
+    const float limit = least_too_far(radius);
+    const auto add = [&](int i, int j) {
+        const float down = static_cast<float>(positions[2 * i]) - static_cast<float>(positions[2 * j]);
+        const float right = static_cast<float>(positions[2 * i + 1]) - static_cast<float>(positions[2 * j + 1]);
+        const float square = down * down + right * right;
+        if (!(square < limit) || i == j || (loss > 0.0 && is_lost(key, i, j, loss))) return;
+        edges.push_back({i, j, weights == Weights::binary ? 1.0f : 1.0f / std::sqrt(square)});
+    };
+    const double longest = std::max(layout.height, layout.width);
+    const int reach = static_cast<int>(std::min(std::ceil(std::sqrt(static_cast<double>(limit))), longest));
+    const double side = 2.0 * reach + 1.0;
+    if (num_agents <= std::min<double>(side, layout.height) * std::min<double>(side, layout.width)) {
+        for (int i = 0; i < num_agents; ++i)
+            for (int j = 0; j < num_agents; ++j) add(i, j);
+        return;
+    }
+    standing.resize(std::max<std::size_t>(standing.size(), layout.size()), -1);
+    for (int i = 0; i < num_agents; ++i) standing[layout.cell(positions[2 * i], positions[2 * i + 1])] = i;
+    for (int i = 0; i < num_agents; ++i) {
+        const std::size_t first = edges.size();
+        const int row = positions[2 * i], col = positions[2 * i + 1];
+        const int left = std::max(col - reach, 0), right = std::min(col + reach, layout.width - 1);
+        for (int r = std::max(row - reach, 0); r <= std::min(row + reach, layout.height - 1); ++r)
+            for (int c = left; c <= right; ++c)
+                if (const int j = standing[layout.cell(r, c)]; j >= 0) add(i, j);
+        std::sort(edges.begin() + static_cast<std::ptrdiff_t>(first), edges.end(),
+                  [](const Edge& one, const Edge& other) { return one.sender < other.sender; });
+    }
+    for (int i = 0; i < num_agents; ++i) standing[layout.cell(positions[2 * i], positions[2 * i + 1])] = -1;
 }
 
 void lose_messages(int num_agents, double loss, std::uint64_t key, int stride, float* weights) {
     for (int i = 0; i < num_agents; ++i, weights += stride)
         for (int j = 0; j < num_agents; ++j)
-            if (weights[j] != 0.0f && uniform(mix(mix(key, i), j)) < loss) weights[j] = 0.0f;
+            if (weights[j] != 0.0f && is_lost(key, i, j, loss)) weights[j] = 0.0f;
 }
 
 double connecting_radius(const std::int32_t* positions, int num_agents, double radius) {

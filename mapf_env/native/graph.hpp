@@ -4,6 +4,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "mapf_env/native/grid.hpp"
+
 namespace mapf {
 
 enum class Weights : int {
@@ -15,6 +17,18 @@ enum class Weights : int {
 // 0. `rows` and `cols` are scratch.
 void communication_graph(const std::int32_t* positions, int num_agents, double radius, Weights weights, int stride,
                          std::vector<float>& rows, std::vector<float>& cols, float* out);
+
+// Robot `receiver` hears robot `sender`.
+struct Edge {
+    int receiver, sender;
+    float weight;
+};
+
+// Appends the edges that `communication_graph` writes, by receiver, then sender, except those that `loss` takes by `key`.
+// In a team that is larger than the neighbourhood of a robot, its neighbourhood is searched instead of the team.
+//   standing  layout.size() of -1; the same again on return
+void find_edges(const Layout& layout, const std::int32_t* positions, int num_agents, double radius, Weights weights,
+                double loss, std::uint64_t key, std::vector<int>& standing, std::vector<Edge>& edges);
 
 // Sets each weight (num_agents, num_agents), `stride` apart, to 0 with probability `loss`, drawn by `key`.
 void lose_messages(int num_agents, double loss, std::uint64_t key, int stride, float* weights);

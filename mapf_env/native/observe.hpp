@@ -1,9 +1,11 @@
 // What robots see: their fields of view.
 #pragma once
 
+#include <algorithm>
+#include <bit>
 #include <cstdint>
+#include <cstring>
 
-#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/grid.hpp"
 
 namespace mapf {
@@ -11,13 +13,33 @@ namespace mapf {
 // The channels of the paper: obstacles, the own goal, robots.
 inline constexpr int num_channels = 3;
 
-// Channels beyond the paper.
-enum class Channel : int { cost_to_go, other_goals, previous_positions };
-
 // Sets the cells of robots or goals (num_agents, 2) in a map of its own.
 template <class T>
 inline void mark(const Layout& layout, const std::int32_t* cells, int num_agents, T value, T* map) {
     for (int i = 0; i < num_agents; ++i) map[layout.cell(cells[2 * i], cells[2 * i + 1])] = value;
+}
+
+// Writes a plane: the window of a map whose upper left corner is `from`, inside a ring of zeros. `fixed_radius` is the
+// radius where the compiler knows it (views of a known size are copied twice as fast), else 0.
+template <int fixed_radius, class T>
+inline void copy_window(const T* from, int stride, int any_radius, T* out) {
+    const int radius = fixed_radius ? fixed_radius : any_radius;
+    const int window = 2 * radius + 1, side = window + 2;
+    std::fill_n(out, side + 1, T{0});
+    out += side + 1;
+    for (int row = 0; row < window; ++row, from += stride, out += side) {
+        std::memcpy(out, from, (window - 1) * sizeof(T));
+        // The last cell, the ring's right end and, in the next row, its left one; as bytes in one piece, whose fourth
+        // is written again.
+        if constexpr (sizeof(T) == 1 && std::endian::native == std::endian::little) {
+            const std::uint32_t end = from[window - 1];
+            std::memcpy(out + window - 1, &end, sizeof end);
+        } else {
+            out[window - 1] = from[window - 1];
+            out[window] = out[window + 1] = T{0};
+        }
+    }
+    std::fill_n(out, side - 1, T{0});
 }
 
 // Fields of view of one team, as the paper's released code lays them out: (num_agents, num_planes, side, side) with
@@ -29,22 +51,5 @@ inline void mark(const Layout& layout, const std::int32_t* cells, int num_agents
 template <class T>
 void observe(const Layout& layout, const T* obstacles, const std::int32_t* positions, const std::int32_t* goals,
              int num_agents, int radius, int num_planes, T* marks, T* out);
-
-// Plane: where another robot's goal lies.
-template <class T>
-void observe_other_goals(const Layout& layout, const std::int32_t* positions, const std::int32_t* goals, int num_agents,
-                         int radius, int num_planes, T* marks, T* out);
-
-// Plane: where robots stood one step before.
-template <class T>
-void observe_previous_positions(const Layout& layout, const std::int32_t* positions, const std::int32_t* previous,
-                                int num_agents, int radius, int num_planes, T* marks, T* out);
-
-// Plane: how many steps more than from here the goal is away from each cell in view, within -2 * radius..2 * radius,
-// which cells without a way have too. As float that is scaled to -1..1; as an integer it is counted from -2 * radius.
-//   distances  (num_agents, layout.size()) steps to each robot's goal
-template <class T>
-void observe_cost_to_go(const Layout& layout, const Distance* distances, const std::int32_t* positions, int num_agents,
-                        int radius, int num_planes, T* out);
 
 }  // namespace mapf

@@ -38,6 +38,12 @@ inline void prefer_values(const float* values, std::uint8_t* preference) {
             std::swap(preference[j], preference[j - 1]);
 }
 
+// A robot's place in the order of a team, the least goes first: the longest under way, equal ones as `key` draws.
+inline std::pair<std::uint64_t, int> pibt_rank(std::int32_t under_way, std::uint64_t key, int robot) {
+    const auto waits = static_cast<std::uint32_t>(under_way);
+    return {static_cast<std::uint64_t>(~waits) << 32 | mix(key, robot) >> 32, robot};
+}
+
 template <class T>
 struct PibtScratch {
     PibtStep<T> step;
@@ -59,8 +65,7 @@ void pibt_shield(const Layout& layout, const T* blocked, const std::int32_t* pos
     const std::size_t n = num_agents;
     for (int i = 0; i < num_agents; ++i) {
         scratch.cells[i] = layout.cell(positions[2 * i], positions[2 * i + 1]);
-        const auto waits = static_cast<std::uint32_t>(under_way[i]);
-        scratch.rank[i] = {static_cast<std::uint64_t>(~waits) << 32 | mix(key, i) >> 32, i};
+        scratch.rank[i] = pibt_rank(under_way[i], key, i);
     }
     std::sort(scratch.rank.begin(), scratch.rank.begin() + num_agents);
     for (int i = 0; i < num_agents; ++i) scratch.order[i] = scratch.rank[i].second;

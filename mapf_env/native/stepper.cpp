@@ -1,8 +1,7 @@
 #include "mapf_env/native/stepper.hpp"
 
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/tuple.h>
-#include <nanobind/stl/vector.h>
+#include <nanobind/stl/string.h>
 #ifndef _WIN32
 #include <unistd.h>
 #endif
@@ -16,8 +15,10 @@
 #include <vector>
 
 #include "mapf_env/native/arrays.hpp"
+#include "mapf_env/native/bag.hpp"
 #include "mapf_env/native/by_agent.hpp"
 #include "mapf_env/native/checks.hpp"
+#include "mapf_env/native/perceive.hpp"
 #include "mapf_env/native/pool.hpp"
 #include "mapf_env/native/team_step.hpp"
 
@@ -36,22 +37,65 @@ int process() {
 #endif
 }
 
-// Where the observations of the only team of a batch go.
+// Where observations go: the arrays of a `mapf_env.Observation`.
+template <class T>
+struct Room {
+    InOut<T, 5> fov;            // (B, N, C, side, side)
+    InOut<float, 3> graph;      // (B, N, N)
+    InOut<float, 3> scalars;    // (B, N, K)
+    InOut<float, 4> edge_attr;  // (B, N, N, D)
+};
+
+template <class T>
+Room<T> room_of(nb::handle out) {
+    Room<T> room;
+    if (!PyTuple_Check(out.ptr()) || PyTuple_GET_SIZE(out.ptr()) != 4 || !nb::try_cast(out[0], room.fov, false) ||
+        !nb::try_cast(out[1], room.graph, false) || !nb::try_cast(out[2], room.scalars, false) ||
+        !nb::try_cast(out[3], room.edge_attr, false))
+        throw nb::type_error(
+            (std::string("out must be an Observation of contiguous memory as buffers() makes it: ") +
+             (sizeof(T) == 1 ? "uint8" : "float32") + " for the views and float32 for the rest")
+                .c_str());
+    return room;
+}
+
+// Where the observations of the only team of a batch and its action masks (N, 5) go.
 template <class T>
 struct Memory {
-    InOut<T, 5> fov;             // (1, N, C, side, side)
-    InOut<float, 3> graph;       // (1, N, N)
-    InOut<std::int8_t, 2> masks; // (N, 5)
+    Room<T> room;
+    InOut<std::int8_t, 2> masks;
 };
+
+float part(nb::handle rewards, const char* name) { return nb::cast<float>(rewards.attr(name)); }
+
+Options options_of(nb::handle config) {
+    const auto says = [&](const char* field, const char* word) {
+        return nb::cast<std::string>(config.attr(field)) == word;
+    };
+    const nb::object rewards = config.attr("rewards");
+    Options options;
+    options.senses = senses_of(config);
+    options.pibt = says("shield", "pibt");
+    options.lifelong = says("task", "lifelong");
+    options.message_loss = nb::cast<double>(config.attr("message_loss"));
+    options.comm_radius = nb::cast<double>(config.attr("comm_radius"));
+    options.connected = says("comm_range", "connected");
+    options.rewards.on_goal = part(rewards, "on_goal");
+    options.rewards.off_goal = part(rewards, "off_goal");
+    options.rewards.arrival = part(rewards, "arrival");
+    options.rewards.replaced = part(rewards, "replaced");
+    options.rewards.solved = part(rewards, "solved");
+    options.rewards.closer = part(rewards, "closer");
+    return options;
+}
 
 // The rules bound to the arrays of B teams, which Python owns and this changes in place.
 template <class T>
 class Stepper {
 public:
-    Stepper(nb::object state, int pad, bool pibt, bool lifelong, int max_cycles, int weights, double message_loss,
-            double comm_radius, bool connected, const std::vector<int>& extras, const std::vector<float>& rewards,
-            int threads)
-        : state_(std::move(state)), threads_(threads) {
+    Stepper(nb::object state, nb::handle config, int threads)
+        : state_(std::move(state)), options_(options_of(config)), threads_(threads) {
+        const int pad = options_.senses.fov_radius;
         const auto positions = array<std::int32_t, 3>("positions");
         const auto obstacles = array<T, 3>("obstacles");
         const std::size_t B = positions.shape(0), N = positions.shape(1);
@@ -60,21 +104,22 @@ public:
         teams_.num_envs = B;
         teams_.num_agents = N;
         const std::size_t size = teams_.layout.size();
-        if (pad < 1 || rows <= 2 * pad || cols <= 2 * pad || threads < 1 || rewards.size() != 6)
+        if (pad < 1 || rows <= 2 * pad || cols <= 2 * pad || threads < 1)
             fail("the arrays of the teams do not fit together");
         teams_.obstacles = own<T>("obstacles", {B, rows * 1u, cols * 1u});
         teams_.positions = own<std::int32_t>("positions", {B, N, 2});
         teams_.goals = own<std::int32_t>("goals", {B, N, 2});
-        teams_.previous = own<std::int32_t>("previous", {B, N, 2});
+        teams_.moves = own<std::int8_t>("moves", {B, N, history});
         teams_.team_sizes = own<std::int32_t>("team_sizes", {B});
         teams_.grids = own<bool>("grids", {B, teams_.layout.height * 1u, teams_.layout.width * 1u});
         teams_.started = own<bool>("started", {B});
         teams_.seeds = own<std::uint64_t>("seeds", {B});
         teams_.comm_radius = own<double>("comm_radius", {B});
-        teams_.regions = own<std::int32_t>("regions", {B, size}, !lifelong);
+        teams_.regions = own<std::int32_t>("regions", {B, size}, !options_.lifelong);
         teams_.under_way = own<std::int32_t>("under_way", {B, N});
         teams_.arrivals = own<std::int32_t>("arrivals", {B, N});
         teams_.times = own<std::int64_t>("times", {B});
+        teams_.max_cycles = own<std::int32_t>("max_cycles", {B});
         teams_.ended = own<bool>("ended", {B});
         teams_.rewards = own<float>("rewards", {B, N});
         teams_.terminated = own<bool>("terminated", {B});
@@ -83,25 +128,21 @@ public:
         teams_.arrived = own<bool>("arrived", {B, N});
         teams_.on_goal = own<bool>("on_goal", {B, N});
         teams_.action_mask = own<std::int8_t>("action_mask", {B, N, num_actions});
-        options_ = {pad, pibt, lifelong, max_cycles, static_cast<Weights>(weights), message_loss,
-                    comm_radius, connected, {},
-                    {rewards[0], rewards[1], rewards[2], rewards[3], rewards[4], rewards[5]}};
-        for (const int extra : extras) options_.extras.push_back(static_cast<Channel>(extra));
-        const bool distances = options_.rewards.closer != 0.0f ||
-                               std::count(extras.begin(), extras.end(), static_cast<int>(Channel::cost_to_go)) > 0;
+        const bool distances = options_.senses.needs_map || options_.rewards.closer != 0.0f;
         teams_.distances = own<Distance>("distances", {B, N, size}, !distances);
         for (int part = 0; part < threads; ++part) scratch_.emplace_back(teams_.layout, static_cast<int>(N));
     }
 
-    void step(In<std::int64_t, 2> actions, InOut<T, 5> fov, InOut<float, 3> graph, bool skip_ended) {
+    // Steps and, unless `out` is None, writes what the teams perceive.
+    void step(In<std::int64_t, 2> actions, nb::handle out, bool skip_ended) {
         const std::size_t B = teams_.num_envs, N = teams_.num_agents;
         if (actions.shape(0) != B || actions.shape(1) != N)
             fail("actions must have shape " + shown({B, N}) + ", got " + shown({actions.shape(0), actions.shape(1)}));
         require_actions(actions.data(), B, N);
-        run({actions.data(), nullptr}, fov, graph, skip_ended);
+        run({actions.data(), nullptr}, out, skip_ended);
     }
 
-    void step_by_values(In<float, 3> values, InOut<T, 5> fov, InOut<float, 3> graph, bool skip_ended) {
+    void step_by_values(In<float, 3> values, nb::handle out, bool skip_ended) {
         const std::size_t B = teams_.num_envs, N = teams_.num_agents;
         if (!options_.pibt)
             fail("actions must have shape " + shown({B, N}) + "; values of all five actions need shield=\"pibt\"");
@@ -112,20 +153,38 @@ public:
             if (std::isnan(values.data()[i]))
                 fail("a value of agent " + std::to_string(i / num_actions % N) + " in environment " +
                      std::to_string(i / num_actions / N) + " is not a number");
-        run({nullptr, values.data()}, fov, graph, skip_ended);
+        run({nullptr, values.data()}, out, skip_ended);
     }
 
     // Writes what the teams perceive; with `chosen` (B) those teams only.
-    void observe(InOut<T, 5> fov, InOut<float, 3> graph, std::optional<In<bool, 1>> chosen) {
-        require_room(fov, graph);
-        if (chosen && chosen->shape(0) != teams_.num_envs) fail("give one choice for each environment");
-        const bool* wanted = chosen ? chosen->data() : nullptr;
-        T* views = fov.data();
-        float* weights = graph.data();
+    void observe(nb::handle out, std::optional<In<bool, 1>> chosen) {
+        const Room<T> room = room_of<T>(out);
+        const Percepts<T> percepts = percepts_of(room);
+        const bool* wanted = wanted_teams(chosen);
         nb::gil_scoped_release release;
         for_each_team([&](std::size_t b, TeamScratch<T>& scratch) {
-            if (wanted == nullptr || wanted[b]) perceive_into(b, scratch, views, weights);
+            if (wanted == nullptr || wanted[b]) perceive_into(b, scratch, percepts);
         });
+    }
+
+    // The bag of the teams that are under way; with `chosen` (B) of those among them.
+    nb::tuple bag(std::optional<In<bool, 1>> chosen) {
+        const bool* wanted = wanted_teams(chosen);
+        std::vector<std::size_t> teams;
+        for (std::size_t b = 0; b < teams_.num_envs; ++b)
+            if (teams_.started[b] && !teams_.ended[b] && (wanted == nullptr || wanted[b])) teams.push_back(b);
+        const std::size_t size = teams_.layout.size();
+        const auto team_of = [&](std::size_t t, int part, bool needs_map) -> BagTeam<T> {
+            auto& scratch = scratch_[part];
+            return {facts_of(teams_, teams[t], needs_map, scratch.greedy), teams_.obstacles + teams[t] * size,
+                    scratch.marks.data(), scratch.standing};
+        };
+        return make_bag<T>(
+            options_.senses, options_.message_loss, teams.size(),
+            [&](std::size_t t) { return static_cast<std::size_t>(teams_.team_sizes[teams[t]]); }, team_of,
+            [&](std::size_t t) { return teams[t]; },
+            [&](std::size_t t) { return message_key(teams_.seeds[teams[t]], teams_.times[teams[t]]); },
+            [&](std::size_t count, const auto& job) { for_each(count, job); });
     }
 
     // What the last step brought to the only team, by agent, in dictionaries that are filled in place, and its action
@@ -162,13 +221,14 @@ public:
         if (teams_.num_envs != 1 || !read_actions(actions, agents, wanted_)) return std::nullopt;
         require_actions(wanted_.data(), 1, wanted_.size());
         require_masks(memory);
-        run({wanted_.data(), nullptr}, memory.fov, memory.graph, false);
+        const Percepts<T> percepts = percepts_of(memory.room);
+        run({wanted_.data(), nullptr}, &percepts, false);
         return outcome_by_agent(memory, agents, rewards, terminated, truncated, infos);
     }
 
     // Begins episodes of M chosen teams with the given cases; nothing is changed if one of them cannot begin.
-    void begin(In<std::int64_t, 1> chosen, In<std::uint64_t, 1> seeds, In<bool, 3> grids, In<std::int32_t, 3> starts,
-               In<std::int32_t, 3> goals, In<std::int32_t, 1> sizes) {
+    void begin(In<std::int64_t, 1> chosen, In<std::uint64_t, 1> seeds, In<std::int32_t, 1> limits, In<bool, 3> grids,
+               In<std::int32_t, 3> starts, In<std::int32_t, 3> goals, In<std::int32_t, 1> sizes) {
         const auto& layout = teams_.layout;
         const std::size_t M = chosen.shape(0), N = teams_.num_agents, height = layout.height, width = layout.width;
         if (grids.shape(0) != M || grids.shape(1) != height || grids.shape(2) != width)
@@ -176,9 +236,11 @@ public:
         if (starts.shape(0) != M || starts.shape(1) != N || starts.shape(2) != 2 || goals.shape(0) != M ||
             goals.shape(1) != N || goals.shape(2) != 2)
             fail("starts and goals must have shape " + shown({M, N, 2}));
-        if (seeds.shape(0) != M || sizes.shape(0) != M) fail("give one seed and size for each team");
+        if (seeds.shape(0) != M || sizes.shape(0) != M || limits.shape(0) != M)
+            fail("give one seed, limit and size for each team");
         for (std::size_t k = 0; k < M; ++k) {
             if (static_cast<std::uint64_t>(chosen(k)) >= teams_.num_envs) fail("there is no such environment");
+            if (limits(k) < 1) fail("max_cycles must be at least 1");
             if (static_cast<std::uint32_t>(sizes(k)) > N) fail("a team is larger than the environment's");
             for (std::size_t i = 2 * N * k; i < 2 * (N * k + sizes(k)); i += 2)
                 for (const std::int32_t* cell : {starts.data() + i, goals.data() + i})
@@ -190,7 +252,7 @@ public:
         for (std::size_t k = 0; k < M; ++k)
             cases.push_back(case_of(teams_, reinterpret_cast<const std::uint8_t*>(grids.data()) + k * height * width,
                                     starts.data() + 2 * N * k, goals.data() + 2 * N * k, sizes(k)));
-        for (std::size_t k = 0; k < M; ++k) begin_team(teams_, options_, chosen(k), seeds(k), cases[k]);
+        for (std::size_t k = 0; k < M; ++k) begin_team(teams_, options_, chosen(k), seeds(k), limits(k), cases[k]);
     }
 
     void write_action_masks() {
@@ -215,14 +277,26 @@ private:
         return held.data();
     }
 
-    void require_room(const InOut<T, 5>& fov, const InOut<float, 3>& graph) const {
-        const std::size_t B = teams_.num_envs, N = teams_.num_agents, side = 2 * options_.fov_radius + 3;
-        const std::size_t planes = num_channels + options_.extras.size();
-        if (fov.shape(0) != B || fov.shape(1) != N || fov.shape(2) != planes || fov.shape(3) != side ||
-            fov.shape(4) != side)
-            fail("the memory for views must have shape " + shown({B, N, planes, side, side}));
-        if (graph.shape(0) != B || graph.shape(1) != N || graph.shape(2) != N)
-            fail("the memory for graphs must have shape " + shown({B, N, N}));
+    // The memory of a room whose shapes are right.
+    Percepts<T> percepts_of(const Room<T>& room) const {
+        const auto& senses = options_.senses;
+        const std::size_t B = teams_.num_envs, N = teams_.num_agents, side = senses.side();
+        const std::size_t C = senses.num_planes, K = senses.robot_columns, D = senses.edge_columns;
+        const auto fits = [](const auto& array, std::initializer_list<std::size_t> shape, const char* what) {
+            for (std::size_t axis = 0; axis < shape.size(); ++axis)
+                if (array.shape(axis) != shape.begin()[axis])
+                    fail(std::string("the memory for ") + what + " must have shape " + shown(shape));
+        };
+        fits(room.fov, {B, N, C, side, side}, "views");
+        fits(room.graph, {B, N, N}, "graphs");
+        fits(room.scalars, {B, N, K}, "scalars");
+        fits(room.edge_attr, {B, N, N, D}, "edge_attr");
+        return {room.fov.data(), room.graph.data(), room.scalars.data(), room.edge_attr.data()};
+    }
+
+    const bool* wanted_teams(const std::optional<In<bool, 1>>& chosen) const {
+        if (chosen && chosen->shape(0) != teams_.num_envs) fail("give one choice for each environment");
+        return chosen ? chosen->data() : nullptr;
     }
 
     void require_masks(const Memory<T>& memory) const {
@@ -230,27 +304,42 @@ private:
             fail("the memory for masks must have shape " + shown({teams_.num_agents, num_actions}));
     }
 
-    void perceive_into(std::size_t b, TeamScratch<T>& scratch, T* fov, float* graph) {
-        const std::size_t N = teams_.num_agents, side = 2 * options_.fov_radius + 3;
-        const std::size_t team = N * (num_channels + options_.extras.size()) * side * side;
-        perceive(teams_, options_, b, scratch, fov + b * team, graph + b * N * N);
+    void perceive_into(std::size_t b, TeamScratch<T>& scratch, const Percepts<T>& all) {
+        const std::size_t N = teams_.num_agents, robots = b * N;
+        const auto& senses = options_.senses;
+        perceive(teams_, options_, b, scratch,
+                 Percepts<T>{all.fov + robots * senses.view(), all.graph + robots * N,
+                             all.scalars + robots * senses.robot_columns,
+                             all.edge_attr + robots * N * senses.edge_columns});
     }
 
+    // Calls job(i, part) for every i in 0..count-1, over the threads.
     template <class Job>
-    void for_each_team(Job&& job) {
-        const std::size_t B = teams_.num_envs, parts = std::min<std::size_t>(threads_, B);
+    void for_each(std::size_t count, Job&& job) {
+        const std::size_t parts = std::min<std::size_t>(threads_, teams_.num_envs);
         if (parts == 1) {
-            for (std::size_t b = 0; b < B; ++b) job(b, scratch_[0]);
+            for (std::size_t i = 0; i < count; ++i) job(i, 0);
             return;
         }
         if (pool_ && process_ != process()) (void)pool_.release();  // threads do not survive a fork
         if (!pool_) pool_ = std::make_unique<Pool>(static_cast<int>(parts));
         process_ = process();
-        pool_->for_each(B, [&](std::size_t b, int part) { job(b, scratch_[part]); });
+        pool_->for_each(count, job);
     }
 
-    void run(Wishes wishes, const InOut<T, 5>& fov, const InOut<float, 3>& graph, bool skip_ended) {
-        require_room(fov, graph);
+    template <class Job>
+    void for_each_team(Job&& job) {
+        for_each(teams_.num_envs, [&](std::size_t b, int part) { job(b, scratch_[part]); });
+    }
+
+    void run(Wishes wishes, nb::handle out, bool skip_ended) {
+        if (out.is_none()) return run(wishes, nullptr, skip_ended);
+        const Room<T> room = room_of<T>(out);
+        const Percepts<T> percepts = percepts_of(room);
+        run(wishes, &percepts, skip_ended);
+    }
+
+    void run(Wishes wishes, const Percepts<T>* percepts, bool skip_ended) {
         const std::size_t B = teams_.num_envs, N = teams_.num_agents;
         const auto ended = std::count(teams_.ended, teams_.ended + B, true);
         if (ended > 0 && !skip_ended)
@@ -258,8 +347,6 @@ private:
                 std::to_string(ended) + " of " + std::to_string(B) + " environments (the first is " +
                 std::to_string(std::find(teams_.ended, teams_.ended + B, true) - teams_.ended) +
                 ") have ended or were never reset: call reset(mask=...) before step");
-        T* views = fov.data();
-        float* weights = graph.data();
         nb::gil_scoped_release release;
         for_each_team([&](std::size_t b, TeamScratch<T>& scratch) {
             if (teams_.ended[b]) {  // its robots do nothing and earn nothing
@@ -270,13 +357,13 @@ private:
                 return;
             }
             step_team(teams_, options_, b, wishes, scratch);
-            perceive_into(b, scratch, views, weights);
+            if (percepts != nullptr) perceive_into(b, scratch, *percepts);
         });
     }
 
     nb::object state_;
-    Teams<T> teams_{};
     Options options_;
+    Teams<T> teams_{};
     std::vector<TeamScratch<T>> scratch_;
     std::vector<std::int64_t> wanted_;
     std::array<nb::object, 3> info_names_{name("replaced"), name("on_goal"), name("arrived")};
@@ -288,20 +375,20 @@ template <class T>
 void define(nb::module_& m, const char* name, const char* memory) {
     nb::class_<Memory<T>>(m, memory, "Where the observations and action masks of the only team of a batch go.")
         .def("__init__",
-             [](Memory<T>* self, InOut<T, 5> fov, InOut<float, 3> graph, InOut<std::int8_t, 2> masks) {
-                 new (self) Memory<T>{std::move(fov), std::move(graph), std::move(masks)};
+             [](Memory<T>* self, nb::handle out, InOut<std::int8_t, 2> masks) {
+                 new (self) Memory<T>{room_of<T>(out), std::move(masks)};
              },
-             "fov"_a.noconvert(), "graph"_a.noconvert(), "masks"_a.noconvert());
+             "out"_a, "masks"_a.noconvert());
     nb::class_<Stepper<T>>(m, name, "The rules of motion and perception, bound to the arrays of B teams.")
-        .def(nb::init<nb::object, int, bool, bool, int, int, double, double, bool, std::vector<int>, std::vector<float>, int>(),
-             "state"_a, "pad"_a, "pibt"_a, "lifelong"_a, "max_cycles"_a, "weights"_a, "message_loss"_a, "comm_radius"_a,
-             "connected"_a, "extras"_a, "rewards"_a, "threads"_a)
-        .def("step", &Stepper<T>::step, "actions"_a, "fov"_a.noconvert(), "graph"_a.noconvert(), "skip_ended"_a,
-             "Execute joint actions (B, N) under the shield and write what the robots perceive.")
-        .def("step_by_values", &Stepper<T>::step_by_values, "values"_a, "fov"_a.noconvert(), "graph"_a.noconvert(),
-             "skip_ended"_a, "Execute by values of all five actions (B, N, 5), under shield \"pibt\" only.")
-        .def("observe", &Stepper<T>::observe, "fov"_a.noconvert(), "graph"_a.noconvert(), "chosen"_a.none(),
+        .def(nb::init<nb::object, nb::handle, int>(), "state"_a, "config"_a, "threads"_a)
+        .def("step", &Stepper<T>::step, "actions"_a, "out"_a.none(), "skip_ended"_a,
+             "Execute joint actions (B, N) under the shield and write what the robots perceive, unless out is None.")
+        .def("step_by_values", &Stepper<T>::step_by_values, "values"_a, "out"_a.none(), "skip_ended"_a,
+             "Execute by values of all five actions (B, N, 5), under shield \"pibt\" only.")
+        .def("observe", &Stepper<T>::observe, "out"_a, "chosen"_a.none(),
              "Write what the robots perceive, of all teams or of the chosen ones (B,).")
+        .def("bag", &Stepper<T>::bag, "chosen"_a.none(),
+             "The bag of the teams that are under way, all of them or the chosen ones (B,).")
         .def("outcome_by_agent", &Stepper<T>::outcome_by_agent, "memory"_a, "agents"_a, "rewards"_a, "terminated"_a,
              "truncated"_a, "infos"_a,
              "Write the masks and fill dictionaries with what the last step brought to the agents of the only team.")
@@ -309,7 +396,7 @@ void define(nb::module_& m, const char* name, const char* memory) {
              "truncated"_a, "infos"_a,
              "Step the only team by actions by agent and fill the dictionaries; whether the episode has ended, or None "
              "if the actions cannot be read.")
-        .def("begin", &Stepper<T>::begin, "chosen"_a, "seeds"_a, "grids"_a, "starts"_a, "goals"_a, "sizes"_a,
+        .def("begin", &Stepper<T>::begin, "chosen"_a, "seeds"_a, "limits"_a, "grids"_a, "starts"_a, "goals"_a, "sizes"_a,
              "Begin episodes of the chosen environments (M,) with cases (M, ...), all of them or none.")
         .def("write_action_masks", &Stepper<T>::write_action_masks, "Bring the state's action_mask (B, N, 5) up to date.");
 }

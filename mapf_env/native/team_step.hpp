@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "mapf_env/native/distances.hpp"
@@ -12,6 +13,7 @@
 #include "mapf_env/native/observe.hpp"
 #include "mapf_env/native/pibt_shield.hpp"
 #include "mapf_env/native/random.hpp"
+#include "mapf_env/native/senses.hpp"
 #include "mapf_env/native/shield.hpp"
 
 namespace mapf {
@@ -22,14 +24,11 @@ struct Rewards {
 };
 
 struct Options {
-    int fov_radius = 0;
+    Senses senses;
     bool pibt = false, lifelong = false;
-    int max_cycles = 0;
-    Weights weights = Weights::binary;
     double message_loss = 0.0;
     double comm_radius = 0.0;
     bool connected = false;  // comm_radius grows at the beginning until the team is connected
-    std::vector<Channel> extras;
     Rewards rewards{};
 };
 
@@ -44,11 +43,13 @@ struct Teams {
     std::uint64_t* seeds;           // (B) of the episodes
     double* comm_radius;            // (B)
     std::int32_t* regions;          // (B, layout.size()), only if goals change
-    std::int32_t *positions, *goals, *previous;  // (B, N, 2)
+    std::int32_t *positions, *goals;  // (B, N, 2)
+    std::int8_t* moves;             // (B, N, history) executed moves, newest first; -1 before the start
     std::int32_t* under_way;        // (B, N) steps since the robot was on its goal
     std::int32_t* arrivals;         // (B, N) how often it has arrived
     Distance* distances;            // (B, N, layout.size()) to the goals, only where they are asked for
     std::int64_t* times;            // (B)
+    std::int32_t* max_cycles;       // (B) steps after which the episode is truncated
     bool *started, *ended;          // (B)
     // What the last step brought.
     float* rewards;                 // (B, N)
@@ -63,8 +64,9 @@ struct alignas(64) TeamScratch {
     ShieldScratch shield;
     PibtScratch<T> pibt;
     std::vector<T> marks;
-    std::vector<std::uint8_t> taken;
+    std::vector<std::uint8_t> taken, greedy;
     std::vector<std::int8_t> executed;
+    std::vector<int> standing;
     std::vector<float> rows, cols;
     std::vector<Distance> distance;
     std::vector<int> queue;
@@ -110,9 +112,10 @@ Case case_of(const Teams<T>& teams, const std::uint8_t* grid, const std::int32_t
     return result;
 }
 
-// Begins an episode of team b.
+// Begins an episode of team b, which is truncated after `limit` steps.
 template <class T>
-void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, std::uint64_t seed, const Case& begun) {
+void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, std::uint64_t seed, std::int32_t limit,
+                const Case& begun) {
     const auto& layout = teams.layout;
     const std::size_t N = teams.num_agents, first = b * N, size = layout.size();
     const std::size_t area = static_cast<std::size_t>(layout.height) * layout.width;
@@ -128,8 +131,9 @@ void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, st
     }
     if (teams.distances != nullptr)
         std::copy(begun.distances.begin(), begun.distances.end(), teams.distances + first * size);
-    for (std::int32_t* cells : {teams.positions, teams.previous}) std::copy_n(begun.starts, 2 * N, cells + 2 * first);
+    std::copy_n(begun.starts, 2 * N, teams.positions + 2 * first);
     std::copy_n(begun.goals, 2 * N, teams.goals + 2 * first);
+    std::fill_n(teams.moves + first * history, N * history, std::int8_t{-1});
     for (std::size_t i = 0; i < N; ++i) {
         const std::int32_t *start = begun.starts + 2 * i, *goal = begun.goals + 2 * i;
         teams.on_goal[first + i] = static_cast<int>(i) < begun.size && start[0] == goal[0] && start[1] == goal[1];
@@ -141,47 +145,78 @@ void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, st
     teams.comm_radius[b] = options.connected ? connecting_radius(begun.starts, begun.size, options.comm_radius)
                                              : options.comm_radius;
     teams.times[b] = 0;
+    teams.max_cycles[b] = limit;
     teams.started[b] = true;
     teams.ended[b] = false;
 }
 
-// Writes what team b perceives: fov (N, planes, side, side) and graph (N, N); zeros for robots that are not there.
+// What team b knows, with its distances and greedy moves if a sense needs them.
 template <class T>
-void perceive(const Teams<T>& teams, const Options& options, std::size_t b, TeamScratch<T>& scratch, T* fov,
-                        float* graph) {
-    const auto& layout = teams.layout;
-    const std::size_t N = teams.num_agents;
-    const int n = teams.team_sizes[b], radius = options.fov_radius, side = 2 * radius + 3;
-    const int planes = num_channels + static_cast<int>(options.extras.size());
-    const std::size_t view = static_cast<std::size_t>(planes) * side * side;
-    const std::int32_t* positions = teams.positions + b * N * 2;
-    const std::int32_t* goals = teams.goals + b * N * 2;
-    observe(layout, teams.obstacles + b * layout.size(), positions, goals, n, radius, planes, scratch.marks.data(), fov);
-    T* plane = fov + num_channels * side * side;
-    for (const Channel channel : options.extras) {
-        switch (channel) {
-            case Channel::cost_to_go:
-                observe_cost_to_go(layout, teams.distances + b * N * layout.size(), positions, n, radius, planes, plane);
-                break;
-            case Channel::other_goals:
-                observe_other_goals(layout, positions, goals, n, radius, planes, scratch.marks.data(), plane);
-                break;
-            case Channel::previous_positions:
-                observe_previous_positions(layout, positions, teams.previous + b * N * 2, n, radius, planes,
-                                           scratch.marks.data(), plane);
-                break;
-        }
-        plane += side * side;
+TeamFacts facts_of(const Teams<T>& teams, std::size_t b, bool needs_map, std::vector<std::uint8_t>& greedy) {
+    const std::size_t first = b * teams.num_agents;
+    TeamFacts team;
+    team.layout = teams.layout;
+    team.num_agents = teams.team_sizes[b];
+    team.positions = teams.positions + 2 * first;
+    team.goals = teams.goals + 2 * first;
+    team.moves = teams.moves + first * history;
+    team.under_way = teams.under_way + first;
+    team.seed = teams.seeds[b];
+    team.time = teams.times[b];
+    team.limit = teams.max_cycles[b];
+    team.comm_radius = teams.comm_radius[b];
+    if (needs_map) {
+        team.distances = teams.distances + first * teams.layout.size();
+        find_greedy_moves(team, greedy);
+        team.greedy = greedy.data();
     }
+    return team;
+}
+
+// The key by which the messages of a team are lost at a time.
+inline std::uint64_t message_key(std::uint64_t seed, std::int64_t time) {
+    return mix(seed_for(Use::messages, seed), static_cast<std::uint64_t>(time));
+}
+
+// Memory for what one team perceives.
+template <class T>
+struct Percepts {
+    T* fov;            // (N, planes, side, side)
+    float* graph;      // (N, N)
+    float* scalars;    // (N, robot_columns)
+    float* edge_attr;  // (N, N, edge_columns)
+};
+
+// Writes what team b perceives; zeros for robots that are not there, and for the features of edges that do not exist.
+template <class T>
+void perceive(const Teams<T>& teams, const Options& options, std::size_t b, TeamScratch<T>& scratch,
+              const Percepts<T>& out) {
+    const auto& layout = teams.layout;
+    const auto& senses = options.senses;
+    const std::size_t N = teams.num_agents, view = senses.view();
+    const std::size_t scalars = senses.robot_columns, attributes = senses.edge_columns;
+    const TeamFacts team = facts_of(teams, b, senses.needs_map, scratch.greedy);
+    const std::size_t n = team.num_agents;
+    write_views(senses, team, teams.obstacles + b * layout.size(), scratch.marks.data(), out.fov);
     const int stride = static_cast<int>(N);
-    communication_graph(positions, n, teams.comm_radius[b], options.weights, stride, scratch.rows, scratch.cols, graph);
+    communication_graph(team.positions, team.num_agents, team.comm_radius, senses.weights, stride, scratch.rows,
+                        scratch.cols, out.graph);
     if (options.message_loss > 0.0)
-        lose_messages(n, options.message_loss, mix(seed_for(Use::messages, teams.seeds[b]), teams.times[b]), stride,
-                      graph);
-    if (n < stride) {
-        std::fill_n(fov + n * view, (N - n) * view, T{0});
-        for (int i = 0; i < n; ++i) std::fill_n(graph + i * N + n, N - n, 0.0f);
-        std::fill_n(graph + n * N, (N - n) * N, 0.0f);
+        lose_messages(team.num_agents, options.message_loss, message_key(team.seed, team.time), stride, out.graph);
+    if (scalars > 0) write_robot_features(senses, team, out.scalars);
+    if (attributes > 0) {
+        std::fill_n(out.edge_attr, N * N * attributes, 0.0f);
+        for (std::size_t i = 0; i < n; ++i)
+            for (std::size_t j = 0; j < n; ++j)
+                if (out.graph[i * N + j] != 0.0f)
+                    write_edge_features(senses, team, static_cast<int>(i), static_cast<int>(j),
+                                        out.edge_attr + (i * N + j) * attributes);
+    }
+    if (n < N) {
+        std::fill_n(out.fov + n * view, (N - n) * view, T{0});
+        for (std::size_t i = 0; i < n; ++i) std::fill_n(out.graph + i * N + n, N - n, 0.0f);
+        std::fill_n(out.graph + n * N, (N - n) * N, 0.0f);
+        std::fill_n(out.scalars + n * scalars, (N - n) * scalars, 0.0f);
     }
 }
 
@@ -228,6 +263,14 @@ void give_goals(const Teams<T>& teams, std::size_t b, TeamScratch<T>& scratch) {
     mark(layout, goals, n, std::uint8_t{0}, scratch.taken.data());
 }
 
+// Puts a move in front of the last moves (history) of a robot; the oldest is forgotten.
+inline void remember(std::int8_t move, std::int8_t* moves) {
+    std::int8_t last[history];
+    std::memcpy(last, moves, history);
+    std::memcpy(moves + 1, last, history - 1);
+    moves[0] = move;
+}
+
 // What team b wants: an action of each robot (N), or values of all five (N, 5).
 struct Wishes {
     const std::int64_t* actions;
@@ -265,7 +308,6 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
     }
 
     const Rewards& scheme = options.rewards;
-    std::copy_n(positions, 2 * n, teams.previous + 2 * first);
     float* rewards = teams.rewards + first;
     bool *on_goal = teams.on_goal + first, *arrived = teams.arrived + first;
     bool all_on_goal = true;
@@ -285,15 +327,17 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
                      (replaced[i] ? scheme.replaced : 0.0f);
     }
     for (int i = 0; i < n; ++i) {
+        remember(executed[i], teams.moves + (first + i) * history);
         teams.arrivals[first + i] += arrived[i];
         teams.under_way[first + i] = on_goal[i] ? 0 : teams.under_way[first + i] + 1;
     }
     if (scheme.closer != 0.0f) {
-        const std::int32_t* before = teams.previous + 2 * first;
+        const auto steps = layout.steps();
         const Distance* distance = teams.distances + first * layout.size();
-        for (int i = 0; i < n; ++i, distance += layout.size())
-            rewards[i] += scheme.closer * static_cast<float>(distance[layout.cell(before[2 * i], before[2 * i + 1])] -
-                                                             distance[layout.cell(positions[2 * i], positions[2 * i + 1])]);
+        for (int i = 0; i < n; ++i, distance += layout.size()) {
+            const int cell = layout.cell(positions[2 * i], positions[2 * i + 1]);
+            rewards[i] += scheme.closer * static_cast<float>(distance[cell - steps[executed[i]]] - distance[cell]);
+        }
     }
     if (const std::size_t missing = N - n; missing > 0) {
         std::fill_n(teams.rewards + first + n, missing, 0.0f);
@@ -306,7 +350,7 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
     };
     const bool terminated = all_on_goal && !options.lifelong;
     update(teams.terminated[b], terminated);
-    update(teams.truncated[b], !terminated && teams.times[b] >= options.max_cycles);
+    update(teams.truncated[b], !terminated && teams.times[b] >= teams.max_cycles[b]);
     update(teams.ended[b], terminated || teams.truncated[b]);
     if (terminated)
         for (int i = 0; i < n; ++i) teams.rewards[first + i] += scheme.solved;

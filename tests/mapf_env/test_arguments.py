@@ -26,6 +26,7 @@ from wrong_arguments import (
     SEED,
     SEVERAL,
     STRING,
+    TEXT,
     WORD,
     assert_refused,
     but,
@@ -35,21 +36,27 @@ from wrong_arguments import (
 SMALL: dict[str, Any] = {"num_agents": 2, "height": 4, "width": 4, "density": 0.0}
 GRID = np.zeros((4, 4), bool)
 INSTANCE = Instance(GRID, [[0, 0], [1, 1]], [[0, 1], [1, 2]])
+STATES = mapf_env.States.start_of([INSTANCE], mapf_env.Senses(), [0])
 SOLUTION = Solution(np.stack([INSTANCE.starts, INSTANCE.goals]))
 SHARE = (*NUMBER, -0.1, 1.5)
 FINITE = (*NUMBER, math.inf, -math.inf)
 STYLE = (*WORD, EnvConfig)
-SETTINGS: dict[str, tuple[Any, ...]] = {
+SENSES: dict[str, tuple[Any, ...]] = {
+    "fov_radius": COUNT_32_BITS,
+    "extra_channels": (*SEVERAL, ("smell",)),
+    "robot_features": (*SEVERAL, ("steps",)),
+    "edge_features": (*SEVERAL, ("voice",)),
+    "memory": (*COUNT, 17),
+    "comm_radius": (*NUMBER, -1.0),
+    "comm_range": WORD,
+    "comm_weights": WORD,
+}
+SETTINGS: dict[str, tuple[Any, ...]] = SENSES | {
     "num_agents": COUNT_32_BITS,
     "height": COUNT_32_BITS,
     "width": COUNT_32_BITS,
     "density": (*SHARE, 1.0),
     "style": STYLE,
-    "fov_radius": COUNT_32_BITS,
-    "extra_channels": (*SEVERAL, ("smell",)),
-    "comm_radius": (*NUMBER, -1.0),
-    "comm_range": WORD,
-    "comm_weights": WORD,
     "message_loss": SHARE,
     "shield": WORD,
     "task": WORD,
@@ -94,6 +101,29 @@ CALLS: dict[str, Any] = {
     "Solution": (Solution, {"paths": SOLUTION.paths}, {"paths": ARRAY}),
     "Solution.violations": (SOLUTION.violations, {"instance": INSTANCE}, {"instance": OBJECT}),
     "EnvConfig": (env_config, {}, SETTINGS),
+    "Senses": (mapf_env.Senses, {}, SENSES),
+    "MapSet": (
+        mapf_env.MapSet,
+        {"grids": [GRID], "border": 4},
+        {"grids": (*SEVERAL, GRID), "border": COUNT_32_BITS, "dtype": (*WORD, "int8")},
+    ),
+    "perceive": (
+        mapf_env.perceive,
+        {"states": STATES, "maps": mapf_env.MapSet([GRID], 4), "senses": mapf_env.Senses()},
+        {"states": OBJECT, "maps": OBJECT, "senses": OBJECT, "message_loss": SHARE, "threads": (*COUNT, 1025)},
+    ),
+    "States.take": (STATES.take, {"chosen": [0]}, {"chosen": but(ARRAY, int, list)}),
+    "States.start_of": (
+        mapf_env.States.start_of,
+        {"instances": [INSTANCE], "senses": mapf_env.Senses(), "maps": [0]},
+        {
+            "instances": (*SEVERAL, INSTANCE),
+            "senses": OBJECT,
+            "maps": (*TEXT, None, 1.5, [0.5], [2**40]),
+            "seeds": (*TEXT, 1.5, [0.5], [-1]),
+            "limits": (*TEXT, None, 1.5, [0.5], [2**40]),
+        },
+    ),
     "Rewards": (Rewards, {}, dict.fromkeys(Rewards.__dataclass_fields__, FINITE)),
     "Maze": (mapf_env.Maze, {}, {"corridor_width": COUNT_32_BITS, "loops": SHARE}),
     "Rooms": (mapf_env.Rooms, {}, {"room_size": COUNT_32_BITS}),
@@ -127,15 +157,20 @@ CALLS: dict[str, Any] = {
             ),
             "instances": (*but(SEVERAL, NoneType), INSTANCE, [INSTANCE, None]),
             "mask": but(ARRAY, NoneType),
+            "max_cycles": (*but(COUNT_32_BITS, NoneType, np.ndarray), [1], [1, 0]),
             "out": (*but(SEVERAL, NoneType), (None, None)),
+            "observe": FLAG,
         },
     ),
+    "BatchedEnv.bag": (begun(batch, "bag"), {}, {"mask": but(ARRAY, NoneType)}),
+    "BatchedEnv.states": (begun(batch, "states"), {}, {"mask": but(ARRAY, NoneType)}),
     "BatchedEnv.step": (
         begun(batch, "step"),
         {"actions": [[4, 4], [4, 4]]},
         {
             "actions": (*ARRAY, [[4, 4]], [[4, 5], [4, 4]], [[True, True]] * 2),
             "out": (*but(SEVERAL, NoneType), (None, None)),
+            "observe": FLAG,
         },
     ),
     "BatchedEnv.observe": (begun(batch, "observe"), {}, {"out": (*but(SEVERAL, NoneType), (None, None))}),
@@ -300,15 +335,20 @@ def test_every_public_call_is_among_these() -> None:
     found = {name.partition(".")[0] for name in CALLS}
     given_by_the_world = {
         "Action",
+        "Bag",
+        "CommRange",
+        "CommWeights",
         "Conflict",
         "Edges",
         "GridEnv",
+        "HISTORY",
         "JointEnv",
         "MOVES",
         "Observation",
         "PogemaMap",
         "SCHEMES",
         "Scene",
+        "Shield",
         "Step",
     }
     assert found | given_by_the_world == set(mapf_env.__all__)

@@ -401,11 +401,13 @@ def test_a_refused_reset_changes_nothing() -> None:
             env.reset(seed=99, instances=instances)
     with pytest.raises(ValueError, match="mask must be bool"):
         env.reset(seed=99, mask=np.zeros(5, bool))
-    fov, graph = env.buffers()
+    out = env.buffers()
     with pytest.raises(ValueError, match="shape"):
-        env.reset(seed=99, out=Observation(fov[:, :2].copy(), graph))
+        env.reset(seed=99, out=out._replace(fov=out.fov[:, :2].copy()))
     with pytest.raises(TypeError, match="out must be an Observation"):
-        env.reset(seed=99, out=Observation(fov.astype(np.float64), graph))
+        env.reset(seed=99, out=out._replace(fov=out.fov.astype(np.float64)))
+    with pytest.raises(ValueError, match="max_cycles must be at least 1, got 0"):
+        env.reset(seed=99, max_cycles=[3, 0])
     with pytest.raises(ValueError, match="non-negative seed"):
         env.reset(seed=-4)
     generator = np.random.default_rng(0)

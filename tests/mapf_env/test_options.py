@@ -15,21 +15,51 @@ from hypothesis import strategies as st
 
 import oracles
 import strategies
-from mapf_env import SCHEMES, BatchedEnv, Instance, Observation, Rewards, communication_edges, random_instance, rules
-from mapf_env.config import CHANNELS
+from mapf_env import (
+    HISTORY,
+    SCHEMES,
+    BatchedEnv,
+    Instance,
+    MapSet,
+    Observation,
+    Rewards,
+    States,
+    communication_edges,
+    perceive,
+    random_instance,
+    rules,
+)
+from mapf_env.senses import channels, edge_features, robot_features
 
 
-def by_the_rules(env: BatchedEnv, previous: npt.NDArray[np.int32], seeds: npt.NDArray[np.uint64]) -> Observation:
-    """What the robots perceive, put together from the pure functions."""
+def by_the_rules(env: BatchedEnv, moves: list[npt.NDArray[np.int8]], under_way: npt.NDArray[np.int32]) -> Observation:
+    """What the robots perceive, put together from the pure functions; `moves` are all moves so far, newest first."""
     config, positions, goals = env.config, env.positions, env.goals
+    B, N = positions.shape[:2]
     maps = rules.bordered(env.grids, config.fov_radius, config.dtype)
-    distances = rules.distance_tables(maps, config.fov_radius, goals)
-    planes = [rules.observe(maps, positions, goals, config.fov_radius)]
-    for channel in config.extra_channels:
-        shown = {"goals": goals, "previous": previous, "distances": distances}
-        planes.append(rules.observe_extra(maps, positions, config.fov_radius, channel, **shown)[:, :, None])  # pyright: ignore[reportArgumentType]
     graph = rules.communication_graph(positions, env.comm_radius, weights=config.comm_weights)
-    return Observation(np.concatenate(planes, 2), rules.lose_messages(graph, config.message_loss, seeds, env.times))
+    graph = rules.lose_messages(graph, config.message_loss, episode_seeds(env), env.times)
+    remembered = [*moves, *[np.full((B, N), -1, np.int8)] * HISTORY][:HISTORY]
+    # Equal grids share one map, so a team's map is not its number.
+    shared = MapSet(env.grids, config.fov_radius, config.dtype)
+    states = States(
+        maps=shared.index,
+        offsets=np.arange(B + 1) * N,
+        positions=positions.reshape(-1, 2),
+        goals=goals.reshape(-1, 2),
+        moves=np.stack(remembered, -1).reshape(-1, HISTORY),
+        under_way=under_way.reshape(-1),
+        seeds=episode_seeds(env),
+        times=env.times.astype(np.int32),
+        limits=np.full(B, config.max_cycles, np.int32),
+        comm_radius=env.comm_radius,
+    )
+    bag = perceive(states, shared, config, message_loss=config.message_loss)
+    fov = bag.fov.reshape(B, N, *bag.fov.shape[1:])
+    assert np.array_equal(fov[:, :, :3], rules.observe(maps, positions, goals, config.fov_radius))
+    edge_attr = np.zeros((B, N, N, config.num_edge_features), np.float32)
+    edge_attr[bag.edge_index[1] // N, bag.edge_index[1] % N, bag.edge_index[0] % N] = bag.edge_attr
+    return Observation(fov, graph, bag.scalars.reshape(B, N, -1), edge_attr)
 
 
 def episode_seeds(env: BatchedEnv) -> npt.NDArray[np.uint64]:
@@ -44,12 +74,12 @@ def test_the_fused_step_is_the_rules_one_after_another(
     env, generator = BatchedEnv(num_envs, threads=threads, **settings), np.random.default_rng(seed)
     config, N = env.config, env.num_agents
     observation = env.reset(seed)
-    seeds, before = episode_seeds(env), env.positions
+    seeds, moves = episode_seeds(env), list[npt.NDArray[np.int8]]()
     under_way, arrivals = np.zeros((num_envs, N), np.int32), np.zeros((num_envs, N), np.int32)
     for time in range(config.max_cycles):
-        expected = by_the_rules(env, before, seeds)
-        assert np.array_equal(observation.fov, expected.fov)
-        assert np.array_equal(observation.graph, expected.graph)
+        expected = by_the_rules(env, moves, under_way)
+        for one, other in zip(observation, expected, strict=True):
+            assert np.array_equal(one, other)
         before, goals = env.positions, env.goals
         maps = rules.bordered(env.grids, config.fov_radius, config.dtype)
         wanted = generator.integers(0, 5, (num_envs, N))
@@ -63,7 +93,7 @@ def test_the_fused_step_is_the_rules_one_after_another(
             executed = rules.pibt_shield(maps, config.fov_radius, before, asked, under_way, seeds, times)
             wanted = values.argmax(-1) if by_values else wanted
         step = env.step(values if by_values else wanted)
-        observation = step.observation
+        observation, moves = step.observation, [executed, *moves]
         after = rules.move(before, executed)
         assert (env.positions == after).all()
         assert (step.replaced == (executed != wanted)).all()
@@ -198,35 +228,6 @@ def test_pibt_pushes_an_idle_robot_aside() -> None:
     executed = rules.pibt_shield(maps, 1, positions, [[3, 4]], under_way, np.zeros(1, np.uint64), np.zeros(1, np.int64))
     assert executed[0, 0] == oracles.RIGHT
     assert executed[0, 1] != oracles.IDLE
-
-
-@given(strategies.crowds(max_side=8), st.data(), st.integers(1, 4))
-def test_extra_channels_are_as_defined(
-    crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, radius: int
-) -> None:
-    grid, team = crowd
-    free = sorted(oracles.free_cells(grid))
-    goals, before = (data.draw(st.permutations(free))[: len(team)] for _ in range(2))
-    for dtype in (np.float32, np.uint8):
-        maps = rules.bordered(grid[None], radius, dtype)
-        positions, targets, previous = (np.array([cells], np.int32) for cells in (team, goals, before))
-        distances = rules.distance_tables(maps, radius, targets)
-        shown = {"goals": targets, "previous": previous, "distances": distances}
-        views = {c: rules.observe_extra(maps, positions, radius, c, **shown)[0] for c in CHANNELS}  # pyright: ignore[reportArgumentType]
-        for i, (row, col) in enumerate(team):
-            steps = oracles.distances(grid, goals[i])
-            if team[i] not in steps:
-                continue  # no instance has such a robot
-            for r in range(-radius - 1, radius + 2):
-                for c in range(-radius - 1, radius + 2):
-                    cell, at = (row + r, col + c), (i, r + radius + 1, c + radius + 1)
-                    inside = max(abs(r), abs(c)) <= radius
-                    assert views["other_goals"][at] == (inside and cell in goals and cell != goals[i])
-                    assert views["previous_positions"][at] == (inside and cell in before)
-                    more = steps[cell] - steps[team[i]] if cell in steps else 2 * radius
-                    more = min(max(more, -2 * radius), 2 * radius)
-                    expected = more + 2 * radius if dtype == np.uint8 else np.float32(more) / np.float32(2 * radius)
-                    assert views["cost_to_go"][at] == (expected if inside else 0)
 
 
 @given(strategies.crowds(max_side=8), st.floats(0.5, 6))
@@ -467,7 +468,9 @@ def test_autoreset_plays_the_episodes_that_a_manual_reset_plays(mode: AutoresetM
 def test_smaller_instances_play_in_a_batch_as_they_play_alone() -> None:
     sizes = ((3, 4, 5), (6, 7, 6), (2, 3, 7))
     instances = [random_instance(num_agents=n, height=h, width=w, seed=n) for n, h, w in sizes]
-    options: dict[str, Any] = {"shield": "pibt", "extra_channels": CHANNELS, "message_loss": 0.2, "reward": "shaped"}
+    options: dict[str, Any] = {"shield": "pibt", "message_loss": 0.2, "reward": "shaped"}
+    options |= {"extra_channels": tuple(channels())[3:], "robot_features": tuple(robot_features())}
+    options |= {"edge_features": tuple(edge_features())}
     batch = BatchedEnv(3, num_agents=6, height=7, width=7, fill=True, **options)
     seen, generator = batch.reset([7, 8, 9], instances=instances), np.random.default_rng(0)
     alone = [BatchedEnv(1, num_agents=n, height=h, width=w, density=0, **options) for n, h, w in sizes]
@@ -477,9 +480,13 @@ def test_smaller_instances_play_in_a_batch_as_they_play_alone() -> None:
         for b, (n, *_) in enumerate(sizes):
             assert np.array_equal(seen.fov[b, :n], apart[b].fov[0])
             assert np.array_equal(seen.graph[b, :n, :n], apart[b].graph[0])
+            assert np.array_equal(seen.scalars[b, :n], apart[b].scalars[0])
+            assert np.array_equal(seen.edge_attr[b, :n, :n], apart[b].edge_attr[0])
             assert not seen.fov[b, n:].any()
-            assert not seen.graph[b, n:].any()
-            assert not seen.graph[b, :, n:].any()
+            assert not seen.scalars[b, n:].any()
+            for of_pairs in (seen.graph[b], seen.edge_attr[b]):
+                assert not of_pairs[n:].any()
+                assert not of_pairs[:, n:].any()
             assert np.array_equal(batch.action_mask()[b, :n], alone[b].action_mask()[0])
             assert batch.action_mask()[b, n:].tolist() == [[0, 0, 0, 0, 1]] * (6 - n)
         actions = generator.integers(0, 5, (3, 6))
@@ -566,18 +573,23 @@ def test_observations_are_written_into_the_callers_memory() -> None:
     assert step.observation is out
     assert np.array_equal(out.fov, expected.observation.fov)
     assert env.observe(out=out) is out
-    wrong = Observation(np.empty((2, 3, 3, 11, 10), np.float32), out.graph)
+    wrong = out._replace(fov=np.empty((2, 3, 3, 11, 10), np.float32))
     with pytest.raises(ValueError, match="the memory for views must have shape"):
         env.step([[4, 4, 4]] * 2, out=wrong)
-    with pytest.raises(TypeError):
-        env.step([[4, 4, 4]] * 2, out=Observation(out.fov.astype(np.float64), out.graph))
+    with pytest.raises(ValueError, match=r"the memory for scalars must have shape \(2, 3, 0\)"):
+        env.step([[4, 4, 4]] * 2, out=out._replace(scalars=np.empty((2, 3, 1), np.float32)))
+    for wrong in (out._replace(fov=out.fov.astype(np.float64)), tuple(out)[:2], out.fov):
+        with pytest.raises(TypeError, match="out must be an Observation of contiguous memory as buffers"):
+            env.step([[4, 4, 4]] * 2, out=wrong)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    with pytest.raises(ValueError, match="a step without observation needs no memory"):
+        env.step([[4, 4, 4]] * 2, out=out, observe=False)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 def test_torch_tensors_are_written_too() -> None:
     torch = pytest.importorskip("torch")
     env = BatchedEnv(2, num_agents=3)
     fov, graph = torch.zeros(2, 3, 3, 11, 11), torch.zeros(2, 3, 3)
-    env.reset(seed=0, out=Observation(fov, graph))
+    env.reset(seed=0, out=Observation(fov, graph, torch.zeros(2, 3, 0), torch.zeros(2, 3, 3, 0)))  # pyright: ignore
     assert np.array_equal(fov.numpy(), env.observe().fov)
 
 
@@ -608,7 +620,10 @@ def test_nothing_is_observed_before_the_first_reset() -> None:
         ({"reward": "gold"}, "reward must be Rewards or one of flowtime"),
         ({"extra_channels": ("smell",)}, "extra_channels must be some of cost_to_go"),
         ({"extra_channels": ("other_goals", "other_goals")}, "extra_channels must be some of"),
-        ({"extra_channels": ("cost_to_go",), "dtype": "uint8", "fov_radius": 64}, "a fov_radius of at most 63"),
+        (
+            {"extra_channels": ("cost_to_go",), "dtype": "uint8", "fov_radius": 64},
+            "cost_to_go takes 257 values with fov_radius=64",
+        ),
     ],
 )
 def test_options_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:

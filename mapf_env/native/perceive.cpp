@@ -1,0 +1,243 @@
+#include "mapf_env/native/perceive.hpp"
+
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <string>
+#include <vector>
+
+#include "mapf_env/native/arrays.hpp"
+#include "mapf_env/native/bag.hpp"
+#include "mapf_env/native/checks.hpp"
+#include "mapf_env/native/observe.hpp"
+#include "mapf_env/native/pool.hpp"
+#include "mapf_env/native/team_step.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace mapf {
+
+Senses senses_of(nb::handle config) {
+    const auto names = [&](const char* field) { return nb::cast<std::vector<std::string>>(config.attr(field)); };
+    const bool by_distance = nb::cast<std::string>(config.attr("comm_weights")) == "distance";
+    return {nb::cast<int>(config.attr("fov_radius")),
+            nb::cast<int>(config.attr("memory")),
+            by_distance ? Weights::distance : Weights::binary,
+            names("extra_channels"),
+            names("robot_features"),
+            names("edge_features")};
+}
+
+namespace {
+
+// The tables of senses.cpp as lists of tuples, in the order of the fields of their rows without the kernels.
+nb::list channel_rows(int fov_radius) {
+    nb::list rows;
+    for (const Channel& row : channels())
+        rows.append(nb::make_tuple(row.name, row.low, row.high, row.unit(fov_radius), row.needs_map, row.needs_history));
+    return rows;
+}
+
+template <class Row>
+nb::list feature_rows(std::span<const Row> table, int memory) {
+    nb::list rows;
+    for (const Row& row : table)
+        rows.append(nb::make_tuple(row.name, row.width(memory), row.low, row.high, row.needs_map, row.needs_history));
+    return rows;
+}
+
+// Maps of any sizes inside borders of `pad` obstacles, one after the other in one array.
+template <class T>
+struct Maps {
+    In<T, 1> cells;
+    In<std::int64_t, 1> offsets;  // (M)
+    In<std::int32_t, 2> sizes;    // (M, 2) height and width
+    int pad;
+
+    Layout layout(std::size_t map) const { return {sizes(map, 0), sizes(map, 1), pad}; }
+    const T* obstacles(std::size_t map) const { return cells.data() + offsets(map); }
+};
+
+// Joint states of T teams; robots of team t are the rows offsets[t]..offsets[t + 1].
+struct TeamStates {
+    In<std::int32_t, 1> maps;
+    In<std::int64_t, 1> offsets;
+    In<std::int32_t, 2> positions, goals;
+    In<std::int8_t, 2> moves;
+    In<std::int32_t, 1> under_way;
+    In<std::uint64_t, 1> seeds;
+    In<std::int32_t, 1> times, limits;
+    In<double, 1> comm_radius;
+
+    std::size_t size() const { return maps.shape(0); }
+    std::size_t robots(std::size_t t) const { return offsets(t + 1) - offsets(t); }
+};
+
+std::string cell_text(const std::int32_t* cell) {
+    return "(" + std::to_string(cell[0]) + ", " + std::to_string(cell[1]) + ")";
+}
+
+// Throws where a state does not fit to its map; all kernels rely on it.
+template <class T>
+void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& senses) {
+    const std::size_t count = states.size(), R = states.positions.shape(0), num_maps = maps.offsets.shape(0);
+    require(maps.pad >= senses.fov_radius, "the maps need a border of at least fov_radius: make the MapSet with a larger one");
+    require(maps.sizes.shape(0) == num_maps && maps.sizes.shape(1) == 2, "give a height and width for each map");
+    for (std::size_t m = 0; m < num_maps; ++m) {
+        const std::int64_t height = maps.sizes(m, 0), width = maps.sizes(m, 1), border = 2 * maps.pad;
+        require(height > 0 && width > 0 && maps.offsets(m) >= 0 &&
+                    maps.offsets(m) + (height + border) * (width + border) <= static_cast<std::int64_t>(maps.cells.size()),
+                "the maps do not fit into their memory");
+    }
+    require(states.offsets.shape(0) == count + 1 && states.offsets(0) == 0, "offsets must have shape (T + 1,) and begin with 0");
+    for (std::size_t t = 0; t < count; ++t)
+        if (states.offsets(t + 1) < states.offsets(t)) fail("offsets must not fall, as they do after team " + std::to_string(t));
+    if (static_cast<std::size_t>(states.offsets(count)) != R)
+        fail("offsets end with " + std::to_string(states.offsets(count)) + ", but there are " + std::to_string(R) + " robots");
+    require(states.positions.shape(1) == 2 && states.goals.shape(0) == R && states.goals.shape(1) == 2,
+            "positions and goals must have shape (R, 2)");
+    require(states.moves.shape(0) == R && states.moves.shape(1) == history, "moves must have shape (R, 16)");
+    require(states.under_way.shape(0) == R, "under_way must have shape (R,)");
+    require(states.seeds.shape(0) == count && states.times.shape(0) == count && states.limits.shape(0) == count &&
+                states.comm_radius.shape(0) == count,
+            "seeds, times, limits and comm_radius must have shape (T,)");
+    for (std::size_t i = 0; i < states.moves.size(); ++i)
+        if (states.moves.data()[i] < -1 || states.moves.data()[i] >= num_actions)
+            fail("moves must lie in -1..4, got " + std::to_string(states.moves.data()[i]) + " for robot " +
+                 std::to_string(i / history));
+    std::vector<std::uint8_t> taken;
+    for (std::size_t t = 0; t < count; ++t) {
+        const std::string where = " of team " + std::to_string(t);
+        if (static_cast<std::uint32_t>(states.maps(t)) >= num_maps)
+            fail("the map" + where + " is number " + std::to_string(states.maps(t)) + ", but there are " +
+                 std::to_string(num_maps) + " maps");
+        if (states.limits(t) < 1) fail("the limit" + where + " must be at least 1");
+        if (!(states.comm_radius(t) >= 0.0)) fail("the comm_radius" + where + " must not be negative");
+        const Layout layout = maps.layout(states.maps(t));
+        const T* obstacles = maps.obstacles(states.maps(t));
+        taken.resize(std::max<std::size_t>(taken.size(), layout.size()), 0);
+        const std::size_t first = states.offsets(t), n = states.robots(t);
+        for (const auto* cells : {&states.positions, &states.goals}) {
+            const char* what = cells == &states.goals ? "the goal of robot " : "robot ";
+            for (std::size_t i = 0; i < n; ++i) {
+                const std::int32_t* cell = cells->data() + 2 * (first + i);
+                const auto text = [&] { return what + std::to_string(i) + where + " at " + cell_text(cell); };
+                if (!layout.contains(cell[0], cell[1])) fail(text() + " lies outside the map");
+                if (obstacles[layout.cell(cell[0], cell[1])] != T{0}) fail(text() + " lies on an obstacle");
+            }
+        }
+        for (std::size_t i = 0; i < n; ++i) {
+            const std::int32_t* cell = states.positions.data() + 2 * (first + i);
+            std::uint8_t& here = taken[layout.cell(cell[0], cell[1])];
+            if (here) fail("two robots" + where + " stand at " + cell_text(cell));
+            here = 1;
+        }
+        for (std::size_t i = 0; i < n; ++i)
+            taken[layout.cell(states.positions(first + i, 0), states.positions(first + i, 1))] = 0;
+    }
+}
+
+// Memory of one thread for the teams of a bag.
+template <class T>
+struct alignas(64) BagScratch {
+    std::vector<T> marks;
+    std::vector<int> standing, queue;
+    std::vector<Distance> table, distance;
+    std::vector<std::uint8_t> greedy;
+};
+
+template <class T>
+nb::tuple perceive_states(const Maps<T>& maps, const TeamStates& states, const Senses& senses, double message_loss,
+                          int threads) {
+    require(threads >= 1, "threads must be at least 1");
+    std::vector<BagScratch<T>> scratch(threads);
+    {
+        nb::gil_scoped_release release;
+        require_sound(maps, states, senses);
+        std::size_t largest = 0;
+        for (std::size_t t = 0; t < states.size(); ++t)
+            largest = std::max<std::size_t>(largest, maps.layout(states.maps(t)).size());
+        for (auto& each : scratch) each.marks.assign(largest, T{0});
+    }
+    const auto team_of = [&](std::size_t t, int part, bool needs_map) -> BagTeam<T> {
+        auto& own = scratch[part];
+        const std::size_t first = states.offsets(t), map = states.maps(t);
+        TeamFacts team;
+        team.layout = maps.layout(map);
+        team.num_agents = static_cast<int>(states.robots(t));
+        team.positions = states.positions.data() + 2 * first;
+        team.goals = states.goals.data() + 2 * first;
+        team.moves = states.moves.data() + first * history;
+        team.under_way = states.under_way.data() + first;
+        team.seed = states.seeds(t);
+        team.time = states.times(t);
+        team.limit = states.limits(t);
+        team.comm_radius = states.comm_radius(t);
+        if (needs_map) {
+            const Grid grid = grid_of(team.layout, maps.obstacles(map));
+            const std::size_t size = team.layout.size();
+            own.table.resize(team.num_agents * size);
+            for (int i = 0; i < team.num_agents; ++i) {
+                distances_to(grid, team.goal(i), own.distance, own.queue);
+                std::copy_n(own.distance.begin(), size, own.table.begin() + static_cast<std::ptrdiff_t>(i * size));
+            }
+            team.distances = own.table.data();
+            find_greedy_moves(team, own.greedy);
+            team.greedy = own.greedy.data();
+        }
+        return {team, maps.obstacles(map), own.marks.data(), own.standing};
+    };
+    std::unique_ptr<Pool> pool;
+    const auto for_each = [&](std::size_t count, const auto& job) {
+        if (threads == 1) {
+            for (std::size_t t = 0; t < count; ++t) job(t, 0);
+            return;
+        }
+        if (!pool) pool = std::make_unique<Pool>(threads);
+        pool->for_each(count, job);
+    };
+    return make_bag<T>(
+        senses, message_loss, states.size(), [&](std::size_t t) { return states.robots(t); }, team_of,
+        [](std::size_t t) { return t; }, [&](std::size_t t) { return message_key(states.seeds(t), states.times(t)); },
+        for_each);
+}
+
+template <class T>
+void define_for_dtype(nb::module_& m) {
+    m.def(
+        "perceive",
+        [](In<T, 1> cells, In<std::int64_t, 1> map_offsets, In<std::int32_t, 2> map_sizes, int pad,
+           In<std::int32_t, 1> maps, In<std::int64_t, 1> offsets, In<std::int32_t, 2> positions,
+           In<std::int32_t, 2> goals, In<std::int8_t, 2> moves, In<std::int32_t, 1> under_way,
+           In<std::uint64_t, 1> seeds, In<std::int32_t, 1> times, In<std::int32_t, 1> limits,
+           In<double, 1> comm_radius, const Senses& senses, double message_loss, int threads) {
+            return perceive_states<T>(
+                {cells, map_offsets, map_sizes, pad},
+                {maps, offsets, positions, goals, moves, under_way, seeds, times, limits, comm_radius}, senses,
+                message_loss, threads);
+        },
+        "cells"_a, "map_offsets"_a, "map_sizes"_a, "pad"_a, "maps"_a, "offsets"_a, "positions"_a, "goals"_a, "moves"_a,
+        "under_way"_a, "seeds"_a, "times"_a, "limits"_a, "comm_radius"_a, "senses"_a, "message_loss"_a, "threads"_a,
+        "The bag (fov, scalars, edge_index, edge_weight, edge_attr, team) of joint states on maps of any sizes.");
+}
+
+}  // namespace
+
+void define_perceive(nb::module_& m) {
+    m.attr("HISTORY") = history;
+    nb::class_<Senses>(m, "Senses", "The senses of robots, compiled from the fields of a `mapf_env.Senses`.")
+        .def("__init__", [](Senses* self, nb::object config) { new (self) Senses(senses_of(config)); }, "config"_a);
+    m.def("channels", &channel_rows, "fov_radius"_a,
+          "(name, low, high, unit, needs_map, needs_history) of each channel of the views, the paper's three first.");
+    m.def("robot_features", [](int memory) { return feature_rows(robot_features(), memory); }, "memory"_a,
+          "(name, width, low, high, needs_map, needs_history) of each feature of a robot.");
+    m.def("edge_features", [](int memory) { return feature_rows(edge_features(), memory); }, "memory"_a,
+          "(name, width, low, high, needs_map, needs_history) of each feature of an edge.");
+    define_for_dtype<float>(m);
+    define_for_dtype<std::uint8_t>(m);
+}
+
+}  // namespace mapf
