@@ -330,7 +330,7 @@ def test_global_random_state_is_neither_read_nor_written() -> None:
         ({"density": float("nan")}, r"density must lie in \[0, 1\), got nan"),
         ({"comm_radius": -1.0}, "comm_radius must not be negative, got -1.0"),
         ({"comm_radius": float("nan")}, "comm_radius must not be negative, got nan"),
-        ({"style": "cave"}, "style must be one of cells, walls, maze, room, warehouse, empty, or a Maze, Rooms or W"),
+        ({"style": "cave"}, "style must be one of cells, walls, maze, room, warehouse, empty, or a Maze, Rooms, W"),
         ({"shield": "none"}, "shield must be one of idle, pibt, got 'none'"),
         ({"dtype": "float64"}, "dtype must be one of float32, uint8, got 'float64'"),
         ({"num_agents": 361}, "has 360 free cells, too few for 361 agents .*: ask for fewer agents or a lower"),
