@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -11,10 +13,10 @@ from experts import arguments
 from experts.many import SOLVER_NAMES, solver_named
 from experts.paths import load_paths, save_paths
 from mapf_env import Instance, animate
+from mapf_env.files import require_outputs
 from mapf_env.problem_file import load_problem
 
 _EXIT_CODES = """exit status: 0 solved or valid, 1 not solved or invalid, 2 an error in the arguments or a file"""
-_MOST_VIOLATIONS = 20
 
 
 class _Parser(argparse.ArgumentParser):
@@ -27,13 +29,30 @@ def main(arguments_given: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments_given)
     try:
-        return options.run(options)
-    except (ValueError, TypeError, OSError) as error:
-        print(f"python -m experts: {' '.join(str(error).split())}", file=sys.stderr)
+        status = options.run(options)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # the reader of the output has gone, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 2
+    except Exception as error:
+        if options.debug:
+            traceback.print_exc()
+        print(f"python -m experts: {_in_one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("python -m experts: interrupted", file=sys.stderr)
         return 130
+
+
+def _in_one_line(error: Exception) -> str:
+    """What went wrong; for errors that are not about the input with their kind, since their text alone says little."""
+    text = " ".join(str(error).split())
+    if isinstance(error, ValueError | TypeError | OSError):
+        return text
+    kind = type(error).__name__
+    advice = "there is not enough memory" if isinstance(error, MemoryError) else "--debug shows where"
+    return f"{kind}: {text} ({advice})" if text else f"{kind} ({advice})"
 
 
 def _parser() -> _Parser:
@@ -83,6 +102,8 @@ def _parser() -> _Parser:
     check.add_argument("paths", metavar="PATHS", help="the file of paths, as `solve --paths` writes it")
     _add_problem(check, "--scen")
     check.set_defaults(run=_check)
+    for command in (solve, check):
+        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
 
 
@@ -107,6 +128,7 @@ def _load(file: str, options: argparse.Namespace, agents: int | None) -> Instanc
 
 
 def _solve(options: argparse.Namespace) -> int:
+    require_outputs([options.paths, options.animation], [options.problem, options.map])
     instance = _load(options.problem, options, options.agents)
     solver = solver_named(
         options.solver,
@@ -141,12 +163,8 @@ def _check(options: argparse.Namespace) -> int:
     found = solution.paths.shape[1]
     instance = _load(options.scen, options, found if options.agents is None else options.agents)
     violations = solution.violations(instance)
-    for violation in violations[:_MOST_VIOLATIONS]:
-        print(violation)
-    if len(violations) > _MOST_VIOLATIONS:
-        print(f"and {len(violations) - _MOST_VIOLATIONS} more")
     if violations:
-        print(f"invalid: {len(violations)} violations")
+        print(*violations, f"invalid: {solution.count_violations(instance)} violations", sep="\n")
         return 1
     print(f"valid: {found} robots, cost {solution.sum_of_costs}, makespan {solution.makespan}")
     return 0

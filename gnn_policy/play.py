@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -19,6 +17,7 @@ from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
 from mapf_env import Instance, _native, replay
 from mapf_env.arguments import integer
+from mapf_env.files import require_outputs, unused
 from mapf_env.problem_file import load_problem
 
 PATIENCE = 4
@@ -77,11 +76,8 @@ def _play(command: Command) -> None:
         command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed
     )
     steps = _patience(instance) if command.max_steps is None else integer(command.max_steps, "max_steps", 1)
-    out = command.out or _free_name(command.file.stem)
-    if not out.parent.is_dir():
-        raise FileNotFoundError(f"{out.parent} is no folder: make it, or give another --out")
-    if out.is_dir():
-        raise FileExistsError(f"{out} is a folder: give the name of a file with --out")
+    out = command.out or unused(Path(f"{command.file.stem}.html"))
+    require_outputs([out], [command.file, command.map])
 
     import torch
 
@@ -105,12 +101,6 @@ def _play(command: Command) -> None:
     replay(instance, solution, out, title=told, config=execution.perceived(policy.config))
     console.print(f"{told} ({seconds:.1f} s)", highlight=False)
     console.print(f"replay: {out}", highlight=False, soft_wrap=True)
-
-
-def _free_name(stem: str) -> Path:
-    """The first of stem.html, stem-2.html, stem-3.html, ... that does not exist."""
-    names = itertools.chain([f"{stem}.html"], (f"{stem}-{number}.html" for number in itertools.count(2)))
-    return next(path for path in map(Path, names) if not os.path.lexists(path))
 
 
 def _patience(instance: Instance) -> int:

@@ -1,16 +1,22 @@
-"""Writing files so that a reader never sees half of one."""
+"""Reading text from anywhere, and writing files so that a reader never sees half of one."""
 
 from __future__ import annotations
 
+import codecs
+import errno
 import os
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 PathLike = str | os.PathLike[str]
 _DRAFT = ".writing-"
+_MOST_BYTES = 1 << 30
+_MOST_LINKS = 40
 
 
 def as_path(path: PathLike, name: str = "path") -> Path:
@@ -20,31 +26,159 @@ def as_path(path: PathLike, name: str = "path") -> Path:
     return Path(path)
 
 
-@contextmanager
-def replacing(path: PathLike) -> Iterator[Path]:
-    """A draft to write, in the place of `path` once the block ends well: a crash leaves the old file or the new.
+def read_bytes(path: PathLike) -> bytes:
+    """Read a whole file.
 
     Raises:
-        OSError: If `path` is a folder or lies in none.
+        ValueError: If it holds more than 1 GiB, or never ends.
+        OSError: If it cannot be read.
     """
-    target = as_path(path)
+    content = bytearray()
+    with as_path(path).open("rb") as file:
+        while part := file.read(1 << 20):
+            content += part
+            if len(content) > _MOST_BYTES:
+                raise ValueError(f"{path} holds more than 1 GiB: split it")
+    return bytes(content)
+
+
+def decoded(content: bytes) -> str:
+    """Decode UTF-8, or UTF-16 that a byte order mark announces.
+
+    Byte order marks are left out, lines end with a line feed, and what cannot be decoded becomes U+FFFD.
+    """
+    marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = content.decode("utf-16" if marked else "utf-8", errors="replace")
+    return text.replace("\ufeff", "").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_text(path: PathLike) -> str:
+    """Read a text file as `decoded` does it.
+
+    Raises:
+        ValueError: If it holds more than 1 GiB.
+        OSError: If it cannot be read.
+    """
+    return decoded(read_bytes(path))
+
+
+@contextmanager
+def replacing(path: PathLike) -> Iterator[Path]:
+    """A draft to write, which replaces `path` once the block ends well: a crash leaves the old file or the new.
+
+    Links are followed, and a replaced file leaves its mode, owner and attributes to the new one. What is no plain file
+    (a device, a pipe), or has a second name or another owner, keeps its identity: the draft is copied into it.
+
+    Raises:
+        OSError: As `require_writable`, or if there is no room; the message names `path`.
+    """
+    target = require_writable(path)
+    into = _must_stay(target)
+    try:
+        with tempfile.TemporaryDirectory(dir=None if into else target.parent, prefix=_DRAFT) as folder:
+            draft = Path(folder, target.name)
+            yield draft
+            if into or not _inherits(draft, target):
+                with draft.open("rb") as source, target.open("ab" if _is_open_file(target) else "wb") as sink:
+                    shutil.copyfileobj(source, sink)
+            else:
+                os.replace(draft, target)
+    except OSError as error:
+        if error.errno is None or (error.filename is not None and _DRAFT not in os.fsdecode(error.filename)):
+            raise
+        raise type(error)(error.errno, error.strerror, os.fspath(path)) from error
+
+
+def require_writable(path: PathLike) -> Path:
+    """Return the file that `path` leads to over links, if it can be written; nothing is changed.
+
+    Raises:
+        OSError: If it is a folder, lies in no folder, or is write-protected.
+    """
+    target = _followed(as_path(path))
     if target.is_dir():
-        raise IsADirectoryError(f"{target} is a folder: give the name of a file")
+        raise IsADirectoryError(f"{path} is a folder: give the name of a file")
     if not target.parent.is_dir():
-        raise FileNotFoundError(f"{target} cannot be written: make the folder {target.parent} first")
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=_DRAFT) as folder:
-        draft = Path(folder, target.name)
-        yield draft
-        os.replace(draft, target)
+        raise FileNotFoundError(f"{path} cannot be written: make the folder {target.parent} first")
+    guarded = target if target.exists() else target.parent
+    if not os.access(guarded, os.W_OK):
+        raise PermissionError(f"{path} cannot be written: {guarded} is write-protected")
+    return target
+
+
+def require_outputs(outputs: Iterable[PathLike | None], inputs: Iterable[PathLike | None]) -> None:
+    """Check before the work that a command can write its outputs, and that none of them overwrites another file of it.
+
+    Raises:
+        ValueError: If two outputs are one file, or an output is an input.
+        OSError: As `require_writable`.
+    """
+    taken = {_followed(as_path(path)): f"the input {path}" for path in inputs if path is not None}
+    for path in outputs:
+        if path is None:
+            continue
+        target = require_writable(path)
+        if target.exists() and not target.is_file():
+            continue  # a device or a pipe takes several
+        for other, role in taken.items():
+            if target == other or (target.exists() and other.exists() and target.samefile(other)):
+                raise ValueError(f"{path} would overwrite {role}: give another name")
+        taken[target] = f"the output {path}"
+
+
+def unused(path: Path) -> Path:
+    """Return `path`, or if something has that name the first of `name-2`, `name-3`, ... that is free."""
+    names = (path if k == 1 else path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(1))
+    return next(name for name in names if not os.path.lexists(name))
 
 
 def remove_drafts(folder: PathLike) -> None:
     """Remove what writers that were killed left in `folder`."""
     for draft in Path(folder).glob(f"{_DRAFT}*"):
-        shutil.rmtree(draft)
+        if draft.is_dir() and not draft.is_symlink():
+            shutil.rmtree(draft)
 
 
 def write_whole(path: PathLike, text: str) -> None:
     """Write `text` as UTF-8 to `path`, as a whole or not at all."""
     with replacing(path) as draft:
         draft.write_bytes(text.encode())
+
+
+def _followed(path: Path) -> Path:
+    """The end of a chain of symbolic links; a link of the system to an open file, as behind /dev/stdout, ends it."""
+    here = path
+    for _ in range(_MOST_LINKS):
+        here = Path(os.path.realpath(here.parent), here.name)
+        if not here.is_symlink() or _is_open_file(here):
+            return here
+        here = here.parent / os.readlink(here)
+    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), os.fspath(path))
+
+
+def _is_open_file(path: Path) -> bool:
+    return path.parts[:2] == ("/", "proc") or path.parts[:3] == ("/", "dev", "fd")
+
+
+def _must_stay(target: Path) -> bool:
+    """True if the file may be written into but not replaced."""
+    if not target.exists():
+        return False
+    status = target.stat()
+    special = not stat.S_ISREG(status.st_mode) or _is_open_file(target)
+    return special or status.st_nlink > 1 or not os.access(target.parent, os.W_OK)
+
+
+def _inherits(draft: Path, target: Path) -> bool:
+    """Give the draft the mode, owner and attributes of the file that it replaces; False if it cannot have the owner."""
+    if not target.exists():
+        return True
+    old, new = target.stat(), draft.stat()
+    if (old.st_uid, old.st_gid) != (new.st_uid, new.st_gid):
+        try:
+            os.chown(draft, old.st_uid, old.st_gid)
+        except PermissionError:
+            return False
+    shutil.copystat(target, draft)
+    os.utime(draft)
+    return True

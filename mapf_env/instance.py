@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +17,51 @@ Cells = npt.NDArray[np.int32]
 Obstacles = npt.NDArray[np.bool_]
 
 
+@dataclass(frozen=True, eq=False, slots=True, weakref_slot=True)
+class SharedMap:
+    """What all instances on one map have in common, whose arrays are read-only; made by `SharedMap.of`."""
+
+    grid: Obstacles
+    """(H, W)"""
+    regions: npt.NDArray[np.int32]
+    """(H, W) numbers the connected regions."""
+
+    @staticmethod
+    def of(grid: npt.ArrayLike) -> SharedMap:
+        """Return the shared map with these obstacles, the same object as long as anybody holds it.
+
+        Raises:
+            ValueError: If `grid` is not a map.
+            TypeError: If it has the wrong dtype.
+        """
+        obstacles = as_obstacles(grid)
+        return SharedMap.known((obstacles.shape, blake2b(obstacles.data).digest()), lambda: _shared(obstacles))
+
+    @staticmethod
+    def known(key: Hashable, make: Callable[[], SharedMap]) -> SharedMap:
+        """Return the map that is known by `key`, a collision-free name of its content; else make it known."""
+        found = _KNOWN.get(key)
+        if found is None:
+            _KNOWN[key] = found = make()
+        return found
+
+
+_KNOWN: WeakValueDictionary[Hashable, SharedMap] = WeakValueDictionary()
+
+
+def _shared(obstacles: Obstacles) -> SharedMap:
+    regions = _native.regions(obstacles)
+    obstacles.flags.writeable = regions.flags.writeable = False
+    return SharedMap(obstacles, regions)
+
+
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
 class Instance:
     """A multi-agent path finding problem that is known to be well formed.
 
     Every start and goal is a free cell of the map, no two robots share a start or a goal, and each goal can be reached
-    from its start. A robot may start on its own goal. The arrays are read-only copies.
+    from its start. A robot may start on its own goal. The arrays are read-only copies, and instances on
+    equal maps share that of the map.
 
     Args:
         grid: (H, W) bool, True is an obstacle. Integers 0 and 1 are accepted.
@@ -34,13 +76,15 @@ class Instance:
     grid: Obstacles
     starts: Cells
     goals: Cells
-    _regions: npt.NDArray[np.int32] = field(init=False)
+    shared_map: SharedMap = field(init=False)
+    """The map, with what belongs to it alone."""
 
-    def __init__(self, grid: npt.ArrayLike, starts: npt.ArrayLike, goals: npt.ArrayLike) -> None:
-        obstacles = as_obstacles(grid)
-        self._set(obstacles, _native.regions(obstacles), _team(starts, "starts"), _team(goals, "goals"))
+    def __init__(self, grid: npt.ArrayLike | SharedMap, starts: npt.ArrayLike, goals: npt.ArrayLike) -> None:
+        shared = grid if isinstance(grid, SharedMap) else SharedMap.of(grid)
+        self._set(shared, _team(starts, "starts"), _team(goals, "goals"))
 
-    def _set(self, grid: Obstacles, regions: npt.NDArray[np.int32], starts: Cells, goals: Cells) -> None:
+    def _set(self, shared: SharedMap, starts: Cells, goals: Cells) -> None:
+        grid, regions = shared.grid, shared.regions
         if starts.shape != goals.shape:
             raise ValueError(f"{len(starts)} starts but {len(goals)} goals: give one goal for each robot")
         _require_free(grid, starts, "start")
@@ -54,13 +98,8 @@ class Instance:
                 f"agent {robot} cannot reach its goal {_cell(goals[robot])} from {_cell(starts[robot])}: "
                 "obstacles separate them; move one of the two or open the map"
             )
-        for name, value in (
-            ("grid", grid),
-            ("starts", starts),
-            ("goals", goals),
-            ("_regions", regions),
-        ):
-            value.flags.writeable = False
+        starts.flags.writeable = goals.flags.writeable = False
+        for name, value in (("grid", grid), ("starts", starts), ("goals", goals), ("shared_map", shared)):
             object.__setattr__(self, name, value)
 
     @property
@@ -75,7 +114,7 @@ class Instance:
             ValueError: If the positions are not distinct free cells from which the goals can be reached.
         """
         seen_from_here = object.__new__(Instance)
-        seen_from_here._set(self.grid, self._regions, _team(positions, "positions"), self.goals)
+        seen_from_here._set(self.shared_map, _team(positions, "positions"), self.goals)
         return seen_from_here
 
     def __eq__(self, other: object) -> bool:

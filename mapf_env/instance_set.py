@@ -12,12 +12,13 @@ import hashlib
 import json
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from mapf_env import arguments
-from mapf_env.files import PathLike, as_path, write_whole
-from mapf_env.instance import Instance, Obstacles
+from mapf_env.files import PathLike, read_text, write_whole
+from mapf_env.instance import Instance, Obstacles, SharedMap
 
 _FORMAT = "mapf-instances"
 _FIELDS = ("map", "starts", "goals", "sha256")
@@ -27,14 +28,9 @@ def instance_hash(instance: Instance) -> str:
     """The SHA-256 of an instance, in hexadecimal digits; equal problems have equal hashes on every machine.
 
     Raises:
-        TypeError: If it is no instance.
+        TypeError: If `instance` is not an `Instance`.
     """
-    arguments.instance_of(instance, Instance, "instance")
-    height, width = instance.grid.shape
-    lines = [f"{height} {width} {instance.num_agents}", *_rows(instance.grid)]
-    ends = np.concatenate([instance.starts, instance.goals], axis=1).tolist()
-    lines += [" ".join(map(str, robot)) for robot in ends]
-    return hashlib.sha256("".join(f"{line}\n" for line in lines).encode()).hexdigest()
+    return _hash(arguments.instance_of(instance, Instance, "instance"))
 
 
 def save_instances(path: PathLike, instances: Sequence[Instance]) -> None:
@@ -44,18 +40,21 @@ def save_instances(path: PathLike, instances: Sequence[Instance]) -> None:
         TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written; an existing one is then unchanged.
     """
-    maps: dict[tuple[str, ...], int] = {}
+    maps: dict[SharedMap, int] = {}
     entries = [
-        {
-            "map": maps.setdefault(tuple(_rows(instance.grid)), len(maps)),
-            "starts": instance.starts.tolist(),
-            "goals": instance.goals.tolist(),
-            "sha256": instance_hash(instance),
-        }
+        json.dumps(
+            {
+                "map": maps.setdefault(instance.shared_map, len(maps)),
+                "starts": instance.starts.tolist(),
+                "goals": instance.goals.tolist(),
+                "sha256": _hash(instance),
+            },
+            separators=(",", ":"),
+        )
         for instance in arguments.each_of(instances, Instance, "instances")
     ]
-    head = json.dumps({"format": _FORMAT, "version": 1, "maps": list(maps)})
-    lines = ",\n".join(json.dumps(entry, separators=(",", ":")) for entry in entries)
+    head = json.dumps({"format": _FORMAT, "version": 1, "maps": [_text(each.grid).split() for each in maps]})
+    lines = ",\n".join(entries)
     write_whole(path, f'{head[:-1]}, "instances": [\n{lines}\n]}}\n')
 
 
@@ -66,41 +65,97 @@ def load_instances(path: PathLike) -> list[Instance]:
         ValueError: If the file is damaged or an instance is not what its hash says; the message names it.
         OSError: If the file cannot be read.
     """
-    try:
-        content = json.loads(as_path(path).read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no set of instances: {error}") from None
-    if not isinstance(content, dict) or content.get("format") != _FORMAT or content.get("version") != 1:
-        raise ValueError(f'{path} is no set of instances: expected "format": "{_FORMAT}" and "version": 1')
-    maps, entries = content.get("maps"), content.get("instances")
-    if not isinstance(maps, list) or not isinstance(entries, list):
-        raise ValueError(f'{path} is no set of instances: expected the lists "maps" and "instances"')
-    grids = [_grid(path, number, rows) for number, rows in enumerate(maps)]
-    return [_instance(path, number, entry, grids) for number, entry in enumerate(entries)]
+    found = InstanceSet(path)
+    for number in range(len(found.maps)):
+        found.map(number)
+    return [found.instance(number) for number in range(len(found))]
 
 
-def _rows(grid: Obstacles) -> list[str]:
-    return ["".join(row) for row in np.where(grid, "@", ".")]
+class InstanceSet:
+    """A file of `save_instances` whose maps and instances are built once they are asked for.
+
+    Raises:
+        ValueError: If it is not a set of instances.
+        OSError: If it cannot be read.
+    """
+
+    def __init__(self, path: PathLike) -> None:
+        self._path = path
+        try:
+            content = json.loads(read_text(path))
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{path} is no set of instances: {error}") from None
+        if not isinstance(content, dict) or content.get("format") != _FORMAT or content.get("version") != 1:
+            raise ValueError(f'{path} is no set of instances: expected "format": "{_FORMAT}" and "version": 1')
+        self.maps, self._entries = content.get("maps"), content.get("instances")
+        if not isinstance(self.maps, list) or not isinstance(self._entries, list):
+            raise ValueError(f'{path} is no set of instances: expected the lists "maps" and "instances"')
+        self._built: dict[int, SharedMap] = {}
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def map(self, number: int) -> SharedMap:
+        """Return the map of that number.
+
+        Raises:
+            ValueError: If it is damaged.
+        """
+        if number not in self._built:
+            self._built[number] = SharedMap.of(_grid(self._path, number, self.maps[number]))
+        return self._built[number]
+
+    def instance(self, number: int) -> Instance:
+        """Return the instance of that number.
+
+        Raises:
+            ValueError: If it is damaged, or is not what its hash says.
+        """
+        entry: Any = self._entries[number]
+        missing = [name for name in _FIELDS if not isinstance(entry, dict) or name not in entry]
+        if missing:
+            raise ValueError(f"{self._path}, instance {number}: {' and '.join(missing)} missing; write the set again")
+        chosen = entry["map"]
+        if type(chosen) is not int or not 0 <= chosen < len(self.maps):
+            raise ValueError(f"{self._path}, instance {number}: there is no map {chosen!r}")
+        shared = self.map(chosen)
+        try:
+            instance = Instance(shared, entry["starts"], entry["goals"])
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"{self._path}, instance {number}: {error}") from error
+        if _hash(instance) != entry["sha256"]:
+            raise ValueError(f"{self._path}, instance {number}: it is not what its hash says; the file was changed")
+        return instance
+
+
+_BEGUN: WeakKeyDictionary[SharedMap, dict[int, Any]] = WeakKeyDictionary()
+"""For each map and number of robots the hash up to the end of the map; that of an instance goes on from there."""
+
+
+def _hash(instance: Instance) -> str:
+    begun = _BEGUN.setdefault(instance.shared_map, {})
+    robots, (height, width) = instance.num_agents, instance.grid.shape
+    if robots not in begun:
+        begun[robots] = hashlib.sha256(f"{height} {width} {robots}\n{_text(instance.grid)}".encode("ascii"))
+    ends = np.concatenate([instance.starts, instance.goals], axis=1).tolist()
+    found = begun[robots].copy()
+    found.update(
+        "".join(f"{row} {col} {goal_row} {goal_col}\n" for row, col, goal_row, goal_col in ends).encode("ascii")
+    )
+    return found.hexdigest()
+
+
+def _text(grid: Obstacles) -> str:
+    """The rows of a map, each with a line feed."""
+    height, width = grid.shape
+    characters = np.full((height, width + 1), ord("\n"), np.uint8)
+    characters[:, :width] = np.where(grid, np.uint8(ord("@")), np.uint8(ord(".")))
+    return characters.tobytes().decode("ascii")
 
 
 def _grid(path: PathLike, number: int, rows: Any) -> Obstacles:
     sound = isinstance(rows, list) and rows and all(isinstance(row, str) for row in rows)
-    if not sound or not rows[0] or any(len(row) != len(rows[0]) or set(row) - {".", "@"} for row in rows):
+    text = "".join(rows) if sound else ""
+    if not text or any(len(row) != len(rows[0]) for row in rows) or text.strip(".@"):
         raise ValueError(f"{path}, map {number}: expected rows of equal length of . and @")
-    return np.array([[cell == "@" for cell in row] for row in rows])
-
-
-def _instance(path: PathLike, number: int, entry: Any, grids: list[Obstacles]) -> Instance:
-    missing = [name for name in _FIELDS if not isinstance(entry, dict) or name not in entry]
-    if missing:
-        raise ValueError(f"{path}, instance {number}: {' and '.join(missing)} missing; write the set anew")
-    try:
-        chosen = entry["map"]
-        if type(chosen) is not int or not 0 <= chosen < len(grids):
-            raise ValueError(f"there is no map {chosen!r}")
-        instance = Instance(grids[chosen], entry["starts"], entry["goals"])
-        if instance_hash(instance) != entry["sha256"]:
-            raise ValueError("it is not what its hash says; the file was changed")
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}, instance {number}: {error}") from error
-    return instance
+    return np.frombuffer(text.encode("ascii"), np.uint8).reshape(len(rows), -1) == ord("@")

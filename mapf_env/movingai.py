@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from hashlib import blake2b
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -15,20 +16,28 @@ import numpy as np
 import numpy.typing as npt
 
 from mapf_env import _native, arguments
-from mapf_env.files import PathLike, as_path, write_whole
-from mapf_env.instance import Instance, Obstacles, as_obstacles
+from mapf_env.files import PathLike, as_path, decoded, read_bytes, read_text, require_outputs, write_whole
+from mapf_env.instance import Instance, Obstacles, SharedMap, as_obstacles
 
-FREE = ".GS"
-"""Characters of cells that robots may enter: ground and swamp."""
+FREE = ".GSE"
+"""Characters of cells that robots may enter: ground, swamp, and emitters of the League of Robot Runners."""
 BLOCKED = "@OTW"
 """Characters of obstacles: out of bounds, trees and water."""
 
 _STEPS_PER_BUCKET = 4
 
 
-class _Entry(NamedTuple):
-    """One line of a scenario."""
+class _Line(NamedTuple):
+    """A line of a file that is not blank, without blanks at its ends."""
 
+    number: int
+    text: str
+
+
+class _Entry(NamedTuple):
+    """One entry of a scenario."""
+
+    line: int
     map_name: str
     size: tuple[int, int]
     start: tuple[int, int]
@@ -42,77 +51,55 @@ def load_map(path: PathLike) -> Obstacles:
         ValueError: If the file is damaged; the message names the file and the line.
         OSError: If the file cannot be read.
     """
-    lines = _lines(path)
-    _require_line(path, lines, 1, "type octile")
-    height, width = _size(path, lines, 2, "height"), _size(path, lines, 3, "width")
-    _require_line(path, lines, 4, "map")
-    rows = lines[4:]
-    if len(rows) < height:
-        raise ValueError(
-            f"{path}, line {len(lines)}: the map ends after {len(rows)} rows, but line 2 says height {height}; "
-            "restore the missing rows or correct the height"
-        )
-    if len(rows) > height:
-        raise ValueError(
-            f"{path}, line {5 + height}: more than the {height} rows that line 2 promises; "
-            "remove the surplus or correct the height"
-        )
-    for number, row in enumerate(rows, start=5):
-        unknown = re.search(f"[^{FREE}{BLOCKED}]", row)
-        if unknown:
-            raise ValueError(
-                f"{path}, line {number}, column {unknown.start() + 1}: unknown character {unknown.group()!r}; "
-                f"free cells are {' '.join(FREE)} and obstacles {' '.join(BLOCKED)}"
-            )
-        if len(row) != width:
-            raise ValueError(
-                f"{path}, line {number}: the row has {len(row)} cells, but line 3 says width {width}; "
-                "restore the row or correct the width"
-            )
-    cells = np.frombuffer("".join(rows).encode("ascii"), dtype=np.uint8).reshape(height, width)
-    return np.isin(cells, np.frombuffer(BLOCKED.encode("ascii"), dtype=np.uint8))
+    return _grid(path, decoded(read_bytes(path)))
 
 
 def load_scen(path: PathLike, num_agents: int | None = None, map_path: PathLike | None = None) -> Instance:
     """Read the first `num_agents` entries of a `.scen` file, or all of them, as an instance: entry i is agent i.
 
-    The map is looked for beside the scenario, by the name given there, unless `map_path` says where it is.
+    The map is looked for next to the scenario, by the name given there, unless `map_path` says where it is.
 
     Raises:
         ValueError: If a file is damaged, has fewer entries than agents asked for, or its entries are no valid instance
             together; the message names the file and the line.
         OSError: If a file cannot be read.
     """
-    lines = _lines(path)
-    if not lines or not re.fullmatch(r"version\s+1(\.0)?", lines[0].strip()):
-        raise ValueError(f"{path}, line 1: expected 'version 1', got {_shown(lines, 1)}; is this a MovingAI scenario?")
+    lines = _lines(read_text(path))
+    if not lines or not re.fullmatch(r"version\s+1(\.0*)?", lines[0].text, re.IGNORECASE):
+        raise ValueError(
+            f"{path}, {_place(lines, 0)}: expected 'version 1', got {_shown(lines, 0)}; is this a MovingAI scenario?"
+        )
     available = len(lines) - 1
     count = available if num_agents is None else arguments.integer(num_agents, "num_agents", 1)
     if count < 1:
-        raise ValueError(f"{path}, line 1: no entries follow; give another file")
+        raise ValueError(f"{path}, {_place(lines, 0)}: no entries follow; give another file")
     if count > available:
         raise ValueError(
-            f"{path}, line {len(lines)}: {count} agents asked for, but only {available} entries; ask for fewer"
+            f"{path}, {_place(lines, -1)}: {count} agents asked for, but only {available} entries; ask for fewer"
         )
-    entries = [_entry(path, number, line) for number, line in enumerate(lines[1 : count + 1], start=2)]
-    for number, entry in enumerate(entries, start=2):
+    entries = [_entry(path, line) for line in lines[1 : count + 1]]
+    for entry in entries:
         if entry.map_name != entries[0].map_name:
             raise ValueError(
-                f"{path}, line {number}: the map is {entry.map_name!r}, but line 2 says {entries[0].map_name!r}; "
-                "all agents of an instance share one map"
+                f"{path}, line {entry.line}: the map is {entry.map_name!r}, but line {entries[0].line} says "
+                f"{entries[0].map_name!r}; all agents of an instance share one map"
             )
-    chosen_map = _beside(path, entries[0].map_name) if map_path is None else as_path(map_path, "map_path")
-    grid = load_map(chosen_map)
-    for number, entry in enumerate(entries, start=2):
-        if entry.size != grid.shape:
+    chosen_map = _beside(path, entries[0]) if map_path is None else as_path(map_path, "map_path")
+    shared = _shared_map(chosen_map)
+    for entry in entries:
+        if entry.size != shared.grid.shape:
             raise ValueError(
-                f"{path}, line {number}: the scenario's map has height {entry.size[0]} and width {entry.size[1]}, "
-                f"but {chosen_map} has height {grid.shape[0]} and width {grid.shape[1]}; give the scenario's own map"
+                f"{path}, line {entry.line}: the scenario's map has height {entry.size[0]} and width {entry.size[1]}, "
+                f"but {chosen_map} has height {shared.grid.shape[0]} and width {shared.grid.shape[1]}: the scenario is "
+                "scaled, or made for another map; give the map of that size"
             )
     try:
-        return Instance(grid, [entry.start for entry in entries], [entry.goal for entry in entries])
+        return Instance(shared, [entry.start for entry in entries], [entry.goal for entry in entries])
     except ValueError as error:
-        raise ValueError(f"{path} with {chosen_map}: {error} (agent i is on line i + 2 of the scenario)") from error
+        agent = int((re.search(r"agents? (\d+)", str(error)) or ["", "0"])[1])
+        raise ValueError(
+            f"{path} with {chosen_map}: {error} (agent {agent} is on line {entries[agent].line} of the scenario)"
+        ) from error
 
 
 def save_map(path: PathLike, grid: npt.ArrayLike) -> None:
@@ -137,11 +124,13 @@ def save_scen(path: PathLike, instance: Instance, map_path: PathLike) -> None:
     holds the shortest distance over the four moves, where MovingAI's own files count diagonal moves too.
 
     Raises:
-        ValueError: If the file at `map_path` holds another map than the instance's, or its name fits no scenario.
+        ValueError: If the file at `map_path` holds another map than the instance's, is `path` itself, or has a name
+            that a scenario cannot hold.
         OSError: If the map cannot be read or the scenario not written; an existing one is then unchanged.
     """
     arguments.instance_of(instance, Instance, "instance")
-    if not as_path(map_path, "map_path").is_file():
+    require_outputs([path], [as_path(map_path, "map_path")])
+    if not as_path(map_path).is_file():
         raise FileNotFoundError(f"no map at {map_path}: write it first, with save_map(map_path, instance.grid)")
     if not np.array_equal(load_map(map_path), instance.grid):
         raise ValueError(
@@ -161,42 +150,94 @@ def save_scen(path: PathLike, instance: Instance, map_path: PathLike) -> None:
     write_whole(path, "\n".join([*lines, ""]))
 
 
-def _lines(path: PathLike) -> list[str]:
-    """The lines of a text file without their ends, and without blank lines at the file's end."""
-    lines = as_path(path).read_text(encoding="utf-8-sig", errors="replace").split("\n")
-    while lines and not lines[-1].strip():
-        lines.pop()
-    return lines
+def _shared_map(path: Path) -> SharedMap:
+    """The map of a file; files of equal content have one in common."""
+    content = read_bytes(path)
+    return SharedMap.known(blake2b(content).digest(), lambda: SharedMap.of(_grid(path, decoded(content))))
 
 
-def _shown(lines: list[str], number: int) -> str:
-    """Line `number` as an error message shows it."""
-    return repr(lines[number - 1][:40]) if number <= len(lines) else "the end of the file"
-
-
-def _require_line(path: PathLike, lines: list[str], number: int, expected: str) -> None:
-    if number > len(lines) or lines[number - 1].split() != expected.split():
+def _grid(path: PathLike, text: str) -> Obstacles:
+    lines = _lines(text)
+    _require_line(path, lines, 0, "type octile", "type tile")
+    sizes: dict[str, int] = {}
+    lines_of: dict[str, int] = {}
+    for k in (1, 2):
+        name, size = _size(path, lines, k, [each for each in ("height", "width") if each not in sizes])
+        sizes[name], lines_of[name] = size, lines[k].number
+    height, width = sizes["height"], sizes["width"]
+    _require_line(path, lines, 3, "map")
+    rows = lines[4:]
+    if len(rows) < height:
         raise ValueError(
-            f"{path}, line {number}: expected {expected!r}, got {_shown(lines, number)}; is this a MovingAI map?"
+            f"{path}, {_place(lines, -1)}: the map ends after {len(rows)} rows, but line {lines_of['height']} says "
+            f"height {height}; restore the missing rows or correct the height"
+        )
+    if len(rows) > height:
+        raise ValueError(
+            f"{path}, line {rows[height].number}: more than the {height} rows that line {lines_of['height']} promises; "
+            "remove the surplus or correct the height"
+        )
+    for number, row in rows:
+        unknown = re.search(f"[^{FREE}{BLOCKED}]", row)
+        if unknown:
+            raise ValueError(
+                f"{path}, line {number}, column {unknown.start() + 1}: unknown character {unknown.group()!r}; "
+                f"free cells are {' '.join(FREE)} and obstacles {' '.join(BLOCKED)}"
+            )
+        if len(row) != width:
+            raise ValueError(
+                f"{path}, line {number}: the row has {len(row)} cells, but line {lines_of['width']} says "
+                f"width {width}; restore the row or correct the width"
+            )
+    cells = np.frombuffer("".join(row.text for row in rows).encode("ascii"), dtype=np.uint8).reshape(height, width)
+    return np.isin(cells, np.frombuffer(BLOCKED.encode("ascii"), dtype=np.uint8))
+
+
+def _lines(text: str) -> list[_Line]:
+    """The lines of a text that are not blank, without blanks at their ends."""
+    numbered = ((number, line.strip()) for number, line in enumerate(text.split("\n"), start=1))
+    return [_Line(number, line) for number, line in numbered if line]
+
+
+def _place(lines: list[_Line], k: int) -> str:
+    """Where the k-th line is, or would be, as an error message names it."""
+    if k < len(lines):
+        return f"line {lines[k].number}"
+    return f"line {lines[-1].number + 1 if lines else 1}"
+
+
+def _shown(lines: list[_Line], k: int) -> str:
+    """The k-th line as an error message shows it."""
+    return repr(lines[k].text[:40]) if k < len(lines) else "the end of the file"
+
+
+def _require_line(path: PathLike, lines: list[_Line], k: int, *expected: str) -> None:
+    if k >= len(lines) or lines[k].text.lower().split() not in [each.split() for each in expected]:
+        raise ValueError(
+            f"{path}, {_place(lines, k)}: expected {expected[0]!r}, got {_shown(lines, k)}; is this a MovingAI map?"
         )
 
 
-def _size(path: PathLike, lines: list[str], number: int, name: str) -> int:
-    fields = lines[number - 1].split() if number <= len(lines) else []
-    if len(fields) != 2 or fields[0] != name or not _is_number(fields[1]) or int(fields[1]) == 0:
+def _size(path: PathLike, lines: list[_Line], k: int, names: list[str]) -> tuple[str, int]:
+    fields = lines[k].text.lower().split() if k < len(lines) else []
+    if len(fields) != 2 or fields[0] not in names or not _is_number(fields[1]) or int(fields[1]) == 0:
+        name = fields[0] if fields and fields[0] in names else names[0]
         raise ValueError(
-            f"{path}, line {number}: expected '{name}' and a positive whole number, got {_shown(lines, number)}; "
+            f"{path}, {_place(lines, k)}: expected '{name}' and a positive whole number, got {_shown(lines, k)}; "
             "correct the header"
         )
-    return int(fields[1])
+    return fields[0], int(fields[1])
 
 
 def _is_number(text: str) -> bool:
     return re.fullmatch("[0-9]{1,9}", text) is not None
 
 
-def _entry(path: PathLike, number: int, line: str) -> _Entry:
-    fields = line.split("\t") if "\t" in line else line.split()
+def _entry(path: PathLike, line: _Line) -> _Entry:
+    number, text = line
+    fields = [field.strip() for field in text.split("\t")]
+    if len(fields) != 9:
+        fields = text.split()
     if len(fields) != 9:
         raise ValueError(
             f"{path}, line {number}: expected 9 fields separated by tabs (bucket, map, width, height, start x, "
@@ -214,7 +255,7 @@ def _entry(path: PathLike, number: int, line: str) -> _Entry:
     if not map_name:
         raise ValueError(f"{path}, line {number}: the map's name is missing; write it in the second field")
     width, height, start_x, start_y, goal_x, goal_y = map(int, numbers)
-    return _Entry(map_name, (height, width), (start_y, start_x), (goal_y, goal_x))
+    return _Entry(number, map_name, (height, width), (start_y, start_x), (goal_y, goal_x))
 
 
 def _is_length(text: str) -> bool:
@@ -225,13 +266,14 @@ def _is_length(text: str) -> bool:
     return math.isfinite(value) and value >= 0
 
 
-def _beside(path: PathLike, map_name: str) -> Path:
+def _beside(path: PathLike, entry: _Entry) -> Path:
     """The map that a scenario names: by its path from there, or, as MovingAI's own tools do, by its last part alone."""
+    map_name = entry.map_name
     parts = PurePosixPath(map_name.replace("\\", "/"))
     folder = Path(path).parent
     for candidate in (folder / map_name, folder / parts, folder / parts.name):
         if os.path.isfile(candidate):  # False for what can be no file's name too
             return candidate
     raise FileNotFoundError(
-        f"{path}, line 2 names the map {map_name!r}, which is not beside it: put it there or give map_path"
+        f"{path}, line {entry.line} names the map {map_name!r}, which is not beside it: put it there or give map_path"
     )

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mapf_env import _native, arguments
-from mapf_env.files import PathLike, as_path
+from mapf_env.files import PathLike, as_path, read_text
 from mapf_env.instance import Cells, Instance, Obstacles
 
 _HEADER = re.compile(r"""(?:"([^"\\]{1,200})"|'([^']{1,200})'|([\w./+-][\w ./+-]{0,199}?))\s*:\s*\|[-+]?\s*""")
@@ -96,7 +96,7 @@ def load_pogema_maps(path: PathLike) -> dict[str, PogemaMap]:
         OSError: If the file cannot be read.
     """
     file = as_path(path)
-    lines = file.read_text(encoding="utf-8-sig", errors="replace").split("\n")
+    lines = read_text(file).split("\n")
     if not any(_HEADER.fullmatch(line) for line in lines):
         return {file.stem: _map_of(_rows(lines), f"{path}, ", 1)}
     blocks: dict[str, tuple[int, list[_Row]]] = {}

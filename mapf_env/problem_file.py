@@ -7,7 +7,7 @@ from pathlib import Path
 from mapf_env.files import PathLike
 from mapf_env.generation import random_instance
 from mapf_env.instance import Instance
-from mapf_env.instance_set import load_instances
+from mapf_env.instance_set import InstanceSet
 from mapf_env.movingai import load_map, load_scen
 from mapf_env.pogema_maps import load_pogema_maps
 
@@ -50,10 +50,10 @@ def load_problem(file: PathLike, *, agents: int | None, map: PathLike | None, in
 
 
 def _of_set(file: PathLike, index: int, agents: int | None) -> Instance:
-    instances = load_instances(file)
-    if not 0 <= index < len(instances):
-        raise ValueError(f"{file} holds {len(instances)} instances, counted from 0: there is no --index {index}")
-    instance = instances[index]
+    found = InstanceSet(file)
+    if not 0 <= index < len(found):
+        raise ValueError(f"{file} holds {len(found)} instances, counted from 0: there is no --index {index}")
+    instance = found.instance(index)
     if agents is None:
         return instance
     if not 1 <= agents <= instance.num_agents:
@@ -61,7 +61,7 @@ def _of_set(file: PathLike, index: int, agents: int | None) -> Instance:
             f"{agents} agents asked for, but instance {index} of {file} has {instance.num_agents}: "
             f"give --agents in 1..{instance.num_agents}"
         )
-    return Instance(instance.grid, instance.starts[:agents], instance.goals[:agents])
+    return Instance(instance.shared_map, instance.starts[:agents], instance.goals[:agents])
 
 
 def _of_pogema(file: PathLike, index: int, agents: int | None, seed: int) -> Instance:

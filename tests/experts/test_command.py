@@ -1,5 +1,6 @@
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,107 @@ def test_errors_are_one_line(scen: Path, line: list[str], message: str, capsys: 
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError(), "MemoryError (there is not enough memory)"),
+        (MemoryError("Unable to allocate 64 GiB"), "MemoryError: Unable to allocate 64 GiB (there is"),
+        (RecursionError("too\ndeep"), "RecursionError: too deep (--debug shows where)"),
+        (RuntimeError("no such device"), "RuntimeError: no such device"),
+        (KeyError("x"), "KeyError: 'x' (--debug"),
+        (UnicodeDecodeError("utf-8", b"x", 0, 1, "bad"), "codec can't decode"),
+    ],
+)
+def test_any_error_is_one_line_and_status_2(
+    scen: Path,
+    error: Exception,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("experts.command.load_problem", fail)
+    for line in (["solve", str(scen)], ["check", str(scen.with_name("paths.txt")), "--scen", str(scen)]):
+        scen.with_name("paths.txt").write_text("Agent 0: (0,0)->")
+        assert main(line) == 2
+        printed = capsys.readouterr().err
+        assert said in printed
+        assert printed.count("\n") == 1
+        assert main([*line, "--debug"]) == 2
+        assert "Traceback" in capsys.readouterr().err
+
+
+def test_outputs_are_checked_before_the_work(scen: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = scen.parent
+    for given, said in (
+        (["--paths", str(folder)], "is a folder"),
+        (["--animation", str(folder / "no" / "a.svg")], "make the folder"),
+        (["--paths", str(scen)], "small.scen would overwrite the input"),
+        (["--map", str(folder / "small.map"), "--animation", str(folder / "small.map")], "would overwrite the input"),
+        (["--paths", str(folder / "a"), "--animation", str(folder / "a")], "a would overwrite the output"),
+    ):
+        before = {each: each.read_bytes() for each in folder.iterdir()}
+        assert main(["solve", str(scen), *given]) == 2
+        printed = capsys.readouterr()
+        assert printed.out == "", "nothing was solved"
+        assert said in printed.err
+        assert printed.err.count("\n") == 1
+        assert {each: each.read_bytes() for each in folder.iterdir()} == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links and pipes of POSIX")
+def test_outputs_go_through_links_and_into_devices(scen: Path) -> None:
+    real, link = scen.with_name("real"), scen.with_name("link")
+    real.write_text("old")
+    link.symlink_to(real)
+    assert main(["solve", str(scen), "--paths", str(link), "--animation", "/dev/null"]) == 0
+    assert link.is_symlink()
+    assert real.read_text().startswith("Agent 0:")
+    line = [sys.executable, "-m", "experts", "solve", str(scen), "--paths", "/dev/stdout"]
+    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    assert "status       solved" in done.stdout
+    assert done.stdout.endswith(real.read_text())
+
+
+def test_a_reader_that_goes_away_is_no_traceback(scen: Path) -> None:
+    line = f"{sys.executable} -m experts solve {scen} --paths /dev/stdout | true"
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=True)
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+def test_a_crowd_is_checked_quickly_and_in_few_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cells = np.argwhere(np.ones((60, 100)))
+    save_instances(tmp_path / "set.json", [Instance(np.zeros((60, 100), bool), cells, cells)])
+    (tmp_path / "paths").write_text("".join(f"Agent {i}: (0,0)->(0,0)->\n" for i in range(6000)))
+    assert main(["check", str(tmp_path / "paths"), "--scen", str(tmp_path / "set.json")]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    count = 2 * 5999 + 2 * 6000 * 5999 // 2
+    assert lines[-2:] == [f"and {count - 20} more", f"invalid: {count} violations"]
+    assert len(lines) == 22
+
+
+def test_one_long_path_among_many_short_ones_needs_little_memory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """400,000 steps of one robot, and one of 19,999 others, once took 12 GB and ended in a traceback."""
+    paths = tmp_path / "paths"
+    long = "Agent 0: " + "(0,0)->(0,1)->" * 200_000
+    paths.write_text(long + "\n" + "".join(f"Agent {i}: (1,{i})->\n" for i in range(1, 20_000)))
+    tracemalloc.start()
+    assert main(["check", str(paths), "--scen", str(tmp_path / "none.json")]) == 2
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    printed = capsys.readouterr().err
+    assert "20000 lines of up to 400000 cells make a table of 8000000000 cells" in printed
+    assert printed.count("\n") == 1
+    assert peak < 150e6
+    paths.write_text(long + "\n" + "".join(f"Agent {i}: (1,{i})->\n" for i in range(1, 10)))
+    assert experts.load_paths(paths).paths.shape == (400_000, 10, 2)
+
+
 @pytest.mark.parametrize("line", [[], ["solve"], ["solve", "x.scen", "--solver", "best"], ["dance"]])
 def test_bad_options_are_one_line(line: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -146,8 +248,66 @@ def test_path_files_round_trip(tmp_path: Path) -> None:
     assert (tmp_path / "paths.txt").read_text() == "Agent 0: (3,4)->\n"
 
 
-@pytest.mark.parametrize("text", ["", "Agent 1: (0,0)->", "Agent 0: (0,0)->(1", "Agent 0: (a,b)", "Agent 0:"])
-def test_damaged_path_files(tmp_path: Path, text: str) -> None:
+PATHS = "Agent 0: (1,0)->(1,1)->(0,1)->\nAgent 1: (2,2)->\n"
+LACAM = """agents=2
+map_file=small.map
+solver=planner
+solved=1
+soc=2
+starts=(0,1),(2,2),
+goals=(1,0),(2,2),
+solution=
+0:(0,1),(2,2),
+1:(1,1),(2,2),
+2:(1,0),(2,2),
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        PATHS,
+        PATHS.replace(",", ", "),
+        PATHS.replace("(", " ( ").replace(")", " ) ").replace(":", " : "),
+        PATHS.replace("->\n", "\n"),
+        PATHS.replace("\n", " \t\n\n"),
+        PATHS.replace("\n", "\r\n"),
+        "\ufeff" + PATHS,
+        PATHS.replace("Agent ", "agent"),
+        LACAM,
+        LACAM.replace(",", ", "),
+        LACAM.replace("\n", " \r\n\r\n"),
+        "\ufeff" + LACAM.rstrip("\n"),
+        LACAM.replace("),\n", ")\n"),
+        LACAM[LACAM.index("solution") :],
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_dialects_of_path_files(tmp_path: Path, text: str, encoding: str) -> None:
+    (tmp_path / "paths.txt").write_bytes(text.encode(encoding))
+    found = experts.load_paths(tmp_path / "paths.txt").paths
+    assert found.tolist() == [[[1, 0], [2, 2]], [[1, 1], [2, 2]], [[0, 1], [2, 2]]]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "the file holds no paths"),
+        ("Agent 1: (0,0)->", "line 1: expected agent 0, got 1"),
+        ("\nAgent 0: (0,0)->(1", r"line 2: expected 'Agent 0:.* got 'Agent 0: \(0,0\)->\(1'"),
+        ("Agent 0: (a,b)", "line 1: expected"),
+        ("Agent 0:", "line 1: expected"),
+        ("Agent 0: (0,-1)->", "line 1: expected"),
+        ("Agent 0: (0,0)->(1234567890,0)", "line 1: expected"),
+        ("Agent 0: (0,0)->\n(0,1)->", "line 2: expected"),
+        ("solved=0\nsolution=\n", "the file holds no paths"),
+        (LACAM.replace("1:(1,1)", "3:(1,1)"), "line 10: expected time 1, got 3"),
+        (LACAM.replace("1:(1,1),(2,2)", "1:(1,1)"), "line 10: 1 cells, but time 0 has 2"),
+        (LACAM.replace("1:(1,1)", "1:(1;1)"), "line 10: expected '0:"),
+        (LACAM.replace("solution=", "solutions"), "line 1: expected 'Agent 0:"),
+    ],
+)
+def test_damaged_path_files(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "paths.txt").write_text(text)
-    with pytest.raises(ValueError, match=r"paths\.txt"):
+    with pytest.raises(ValueError, match=rf"paths\.txt.*{said}"):
         experts.load_paths(tmp_path / "paths.txt")

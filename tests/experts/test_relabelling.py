@@ -20,7 +20,7 @@ def first_actions(instance: Instance, **options: float) -> tuple[list[int], bool
 @settings(deadline=None, max_examples=60)
 @given(strategies.instances(max_side=5, max_agents=3), st.integers(0, 9), st.sampled_from([1.0, 1.2]), st.data())
 def test_labels_are_the_first_actions_of_solve(instance: Instance, seed: int, w: float, data: st.DataObject) -> None:
-    region = np.argwhere(instance._regions == instance._regions[tuple(instance.starts[0])])
+    region = np.argwhere(instance.shared_map.regions == instance.shared_map.regions[tuple(instance.starts[0])])
     orders = data.draw(st.lists(st.permutations(range(len(region))), min_size=1, max_size=4))
     positions = np.array([region[list(order[: instance.num_agents])] for order in orders])
     actions, solved = experts.relabel(instance, positions, w=w, seed=seed, node_limit=500)

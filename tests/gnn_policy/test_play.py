@@ -75,6 +75,17 @@ def test_robots_are_placed_on_a_map_by_the_seed(home):
     assert len(pages["a"]["scenes"][0]["goals"]) == 4
 
 
+def test_a_page_that_nobody_named_overwrites_nothing(home, capsys):
+    (home / "own.html").write_text("mine")
+    for expected in ("own-2.html", "own-3.html"):
+        played("own.scen", "--max-steps", "1")
+        assert f"replay: {expected}" in capsys.readouterr().out
+        assert shown(home / expected)["scenes"]
+    assert (home / "own.html").read_text() == "mine"
+    played("own.scen", "--max-steps", "1", "--out", "own.html")
+    assert shown(home / "own.html")["scenes"]
+
+
 def test_every_option_reaches_the_rollout(home, monkeypatch):
     asked = []
     monkeypatch.setattr(
@@ -131,8 +142,10 @@ def test_a_team_that_is_home_has_solved_it(home, capsys):
         ("own.map --agents 3 --device abacus", "abacus"),
         ("own.scen --map elsewhere", "elsewhere"),
         ("own.map --agents 3 --row best", "unknown word 'best'"),
-        ("own.map --agents 3 --out none/page.html", "none is no folder"),
+        ("own.map --agents 3 --out none/page.html", "none/page.html cannot be written: make the folder"),
         ("own.map --agents 3 --out elsewhere", "elsewhere is a folder"),
+        ("own.map --agents 3 --out own.map", "own.map would overwrite the input own.map"),
+        ("elsewhere/far.scen --map own.map --out own.map", "own.map would overwrite the input own.map"),
         ("none.map --agents 3", "none.map"),
         ("none.scen", "none.scen"),
         ("elsewhere --agents 3", "must be a map"),

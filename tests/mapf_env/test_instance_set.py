@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import pickle
+import tracemalloc
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,7 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import strategies
-from mapf_env import Instance, instance_hash, load_instances, save_instances
+from mapf_env import Instance, instance_hash, instance_set, load_instances, save_instances
+from mapf_env.instance_set import InstanceSet
 
 SLOW = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
 
@@ -41,6 +44,44 @@ def test_a_change_is_noticed(tmp_path: Path) -> None:
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="instance 0: it is not what its hash says"):
         load_instances(path)
+
+
+def test_a_set_is_read_whatever_editor_saved_it(tmp_path: Path) -> None:
+    path, instance = tmp_path / "set.json", Instance(np.eye(2, dtype=bool), [[0, 1]], [[0, 1]])
+    save_instances(path, [instance])
+    text = path.read_text()
+    for content in (
+        ("\ufeff" + text).encode(),
+        text.encode("utf-16"),
+        text.replace("\n", "\r\n").encode(),
+        json.dumps(json.loads(text), indent=4).encode(),
+    ):
+        path.write_bytes(content)
+        assert load_instances(path) == [instance]
+
+
+def test_instances_on_one_map_share_it(tmp_path: Path) -> None:
+    """One grid, one table of regions and one text for each map, however many instances there are."""
+    grid = np.zeros((300, 400), bool)
+    instances = [Instance(grid.copy(), [[k, k]], [[k, k + 1]]) for k in range(200)]
+    tracemalloc.start()
+    save_instances(tmp_path / "set.json", (each for each in instances))
+    loaded = load_instances(tmp_path / "set.json")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert loaded == instances
+    assert len({id(each.grid) for each in [*loaded, *instances, pickle.loads(pickle.dumps(instances[0]))]}) == 1
+    assert len(json.loads((tmp_path / "set.json").read_text())["maps"]) == 1
+    assert peak < 8e6, "the text of one map, and a list of instances"
+
+
+def test_one_instance_of_a_set_is_built_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    instances = [Instance(np.zeros((2, k + 2), bool), [[0, 0]], [[1, k]]) for k in range(5)]
+    save_instances(tmp_path / "set.json", instances)
+    made: list[int] = []
+    monkeypatch.setattr(instance_set, "_grid", lambda *asked: made.append(asked[1]) or np.zeros((2, 5), bool))
+    assert InstanceSet(tmp_path / "set.json").instance(3) == instances[3]
+    assert made == [3]
 
 
 @given(st.data())

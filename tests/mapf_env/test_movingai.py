@@ -97,6 +97,56 @@ def test_blank_lines_at_the_end_and_spaces_between_fields_are_fine(files):
     assert load_scen(scen).num_agents == 2
 
 
+DIALECTS = {
+    "blanks at the ends of lines": lambda text: text.replace("\n", " \t\n"),
+    "blanks at the beginnings of lines": lambda text: " " + text.replace("\n", "\n  ").rstrip(" "),
+    "blank lines between the lines": lambda text: text.replace("\n", "\n \n\n"),
+    "a blank line after the head": lambda text: text.replace("map\n", "map\n\n").replace("version 1", "version 1\n"),
+    "no line end at the end": lambda text: text.rstrip("\n"),
+    "line ends of Windows": lambda text: text.replace("\n", "\r\n"),
+    "line ends of old Macs": lambda text: text.replace("\n", "\r"),
+    "a byte order mark": lambda text: "\ufeff" + text,
+    "a byte order mark where files were joined": lambda text: text.replace("\n", "\n\ufeff"),
+    "version 1.00": lambda text: text.replace("version 1", "version 1.00"),
+    "version 1.0 in capitals": lambda text: text.replace("version 1", "VERSION\t1.0"),
+    "tiles": lambda text: text.replace("octile", "tile"),
+    "width before height": lambda text: text.replace("height 3\nwidth 4", "width 4\nheight 3"),
+    "a head in capitals": lambda text: text.replace("height", "HEIGHT").replace("map\n..", "Map\n.."),
+    "emitters": lambda text: text.replace("GS", "ES"),
+    "tabs with blanks": lambda text: text.replace("\t", " \t "),
+    "blanks for tabs": lambda text: text.replace("\t", "   "),
+    "some blanks for tabs": lambda text: text.replace("\t2", " 2"),
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS.values(), ids=DIALECTS)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_harmless_dialects_are_read(files, dialect, encoding):
+    scen = files()
+    for name, text in (("a.map", MAP), ("a.scen", SCEN)):
+        (scen.parent / name).write_bytes(dialect(text).encode(encoding))
+    assert np.array_equal(load_map(scen.parent / "a.map"), GRID)
+    assert load_scen(scen) == Instance(GRID, [(0, 0), (1, 1)], [(1, 2), (2, 3)])
+    assert load_scen(scen, 1).num_agents == 1
+
+
+def test_scenarios_on_one_map_share_it(files):
+    scen = files()
+    first, second = load_scen(scen), load_scen(scen, 1)
+    assert first.shared_map is second.shared_map
+    assert first.grid is second.grid
+    (scen.parent / "a.map").write_text(MAP.replace("..@.", "...."))
+    third = load_scen(scen)
+    assert third.shared_map is not first.shared_map
+    assert not third.grid[0].any()
+    grid = load_map(scen.parent / "a.map")
+    grid[0, 0] = True  # a copy of the caller's
+    assert not third.grid[0, 0]
+    (scen.parent / "a.map").write_text(MAP)
+    (scen.parent / "a.map").write_bytes(MAP.replace("\n", "\r\n").encode())
+    assert load_scen(scen).shared_map is first.shared_map, "another file, the same map"
+
+
 def test_entries_after_the_first_n_are_not_read(files):
     assert load_scen(files(SCEN + "damaged\n"), num_agents=2).num_agents == 2
 
@@ -140,12 +190,18 @@ def test_a_scenario_finds_a_map_saved_in_another_folder(tmp_path):
         (MAP + "....\n", "line 8: more than the 3 rows"),
         (MAP.replace("GS.T", "GS."), "line 6: the row has 3 cells, but line 3 says width 4; restore"),
         (MAP.replace("GS.T", "GS.T."), "line 6: the row has 5 cells"),
-        (MAP.replace("GS.T\n", "\n"), "line 6: the row has 0 cells"),
+        (MAP.replace("GS.T\n", "\n"), "line 7: the map ends after 2 rows, but line 2 says height 3"),
+        (MAP.replace("width 4", "height 4"), "line 3: expected 'width' and a positive whole number, got 'height 4'"),
+        (MAP.replace("height 3\nwidth 4", "width 4\nheight 0"), "line 3: expected 'height' and a positive"),
+        (
+            MAP.replace("height 3\nwidth 4", "width 5\n\nheight 3"),
+            "line 6: the row has 4 cells, but line 2 says width 5",
+        ),
         (
             MAP.replace("GS.T", "GSxT"),
-            "line 6, column 3: unknown character 'x'; free cells are . G S and obstacles @ O T W",
+            "line 6, column 3: unknown character 'x'; free cells are . G S E and obstacles @ O T W",
         ),
-        (MAP.replace("GS.T", "GS.T "), "line 6, column 5: unknown character ' '"),
+        (MAP.replace("GS.T", "GS T"), "line 6, column 3: unknown character ' '"),
         (MAP.replace("..@.", "..é."), "line 5, column 3: unknown character 'é'"),
         (MAP.replace("..@.", "..\0."), r"line 5, column 3: unknown character '\x00'"),
     ],
@@ -166,7 +222,8 @@ def test_damaged_maps(tmp_path, text, message):
         (SCEN.replace("version 1", "version 2"), "line 1: expected 'version 1', got 'version 2'"),
         ("version 1\n", "line 1: no entries follow"),
         (SCEN.replace("\t2.41421356\n1", "\n1"), "line 2: expected 9 fields separated by tabs"),
-        (SCEN.replace("version 1\n", "version 1\n\n"), "line 2: expected 9 fields"),
+        (SCEN.replace("version 1\n", "version 1\n\n").replace("\t3\t2\t", "\t2\t1\t"), "(agent 0 is on line 3 of"),
+        (SCEN.replace("version 1", "version 1.5"), "line 1: expected 'version 1', got 'version 1.5'"),
         (SCEN[:60], "line 3: expected 9 fields"),
         (SCEN.replace("\n1\ta", "\none\ta"), "line 3: the bucket must be a whole number from 0, got 'one'"),
         (SCEN.replace("\t0\t0\t2", "\tx\t0\t2"), "line 2: the start x must be a whole number from 0, got 'x'"),
@@ -178,6 +235,7 @@ def test_damaged_maps(tmp_path, text, message):
         (SCEN.replace("\n0\ta.map", "\n0\t"), "line 2: the map's name is missing"),
         (SCEN.replace("1\ta.map", "1\tb.map"), "line 3: the map is 'b.map', but line 2 says 'a.map'"),
         (SCEN.replace("\t4\t3\t1", "\t3\t4\t1"), "line 3: the scenario's map has height 4 and width 3, but"),
+        (SCEN.replace("\t4\t3\t", "\t8\t6\t"), "has height 3 and width 4: the scenario is scaled, or made for another"),
         (SCEN.replace("\t0\t0\t2", "\t4\t0\t2"), "the start (0, 4) of agent 0 lies outside the 3x4 map"),
         (SCEN.replace("\t0\t0\t2", "\t2\t0\t2"), "the start (0, 2) of agent 0 lies on an obstacle"),
         (SCEN.replace("\t0\t0\t2", "\t3\t0\t2"), "agent 0 cannot reach its goal (1, 2) from (0, 3)"),
@@ -230,6 +288,9 @@ def test_a_scenario_is_only_written_for_its_own_map(tmp_path):
     save_map(tmp_path / "a.map", ~GRID)
     with pytest.raises(ValueError, match="is not the instance's map"):
         save_scen(tmp_path / "a.scen", instance, tmp_path / "a.map")
+    save_map(tmp_path / "a.map", GRID)
+    with pytest.raises(ValueError, match=r"a\.map would overwrite the input"):
+        save_scen(tmp_path / "a.map", instance, tmp_path / "a.map")
     save_map(tmp_path / "a\tb.map", GRID)
     with pytest.raises(ValueError, match="holds a tab or a line break"):
         save_scen(tmp_path / "a.scen", instance, tmp_path / "a\tb.map")
