@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -33,7 +33,7 @@ def instance_hash(instance: Instance) -> str:
     return _hash(arguments.instance_of(instance, Instance, "instance"))
 
 
-def save_instances(path: PathLike, instances: Sequence[Instance]) -> None:
+def save_instances(path: PathLike, instances: Iterable[Instance]) -> None:
     """Write the instances to one file, as a whole or not at all; a map that several share is written once.
 
     Raises:
@@ -87,9 +87,11 @@ class InstanceSet:
             raise ValueError(f"{path} is no set of instances: {error}") from None
         if not isinstance(content, dict) or content.get("format") != _FORMAT or content.get("version") != 1:
             raise ValueError(f'{path} is no set of instances: expected "format": "{_FORMAT}" and "version": 1')
-        self.maps, self._entries = content.get("maps"), content.get("instances")
-        if not isinstance(self.maps, list) or not isinstance(self._entries, list):
+        maps, entries = content.get("maps"), content.get("instances")
+        if not isinstance(maps, list) or not isinstance(entries, list):
             raise ValueError(f'{path} is no set of instances: expected the lists "maps" and "instances"')
+        self.maps: list[Any] = maps
+        self._entries: list[Any] = entries
         self._built: dict[int, SharedMap] = {}
 
     def __len__(self) -> int:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from mapf_env import arguments, svg
 from mapf_env.files import PathLike, write_whole
-from mapf_env.instance import Instance
+from mapf_env.instance import Cells, Instance
 from mapf_env.solution import Solution
 
 _CELL = 24
@@ -38,6 +38,7 @@ def animate(
     title: str | None = None,
     step_seconds: float = 0.4,
     pause_steps: int = 3,
+    goals: npt.ArrayLike | None = None,
 ) -> str:
     """The robots driving along their paths, as an SVG that plays in a loop.
 
@@ -51,9 +52,12 @@ def animate(
         title: A line above the map.
         step_seconds: How long a step lasts.
         pause_steps: For how many steps' time the loop rests on the first and on the last state.
+        goals: The goals (T + 1, N, 2) at each time, `env.goals` after the reset and each step of a lifelong task; those
+            of the instance at all times if not given.
 
     Raises:
-        ValueError: If the paths are of another number of agents or leave the map, or a time is out of range.
+        ValueError: If the paths are of another number of agents or leave the map, a time is out of range, or the goals
+            do not belong to the paths.
         TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written.
     """
@@ -62,7 +66,8 @@ def animate(
     if not (math.isfinite(arguments.number(step_seconds, "step_seconds")) and step_seconds > 0):
         raise ValueError(f"step_seconds must be a positive number, got {step_seconds}")
     arguments.integer(pause_steps, "pause_steps", 0, arguments.MOST_INT)
-    picture = _page(instance, title, _moving(instance, solution, step_seconds, pause_steps))
+    changing = None if goals is None else goals_over_time(instance, solution, goals)
+    picture = _page(instance, title, _moving(instance, solution, changing, step_seconds, pause_steps))
     if path is not None:
         write_whole(path, picture)
     return picture
@@ -96,13 +101,18 @@ def draw(instance: Instance, solution: Solution | None = None) -> str:
     return _page(instance, None, [*trails, *goals, *robots, *rings, *caption])
 
 
-def _moving(instance: Instance, solution: Solution, step_seconds: float, pause_steps: int) -> list[str]:
+def _moving(
+    instance: Instance, solution: Solution, changing: Cells | None, step_seconds: float, pause_steps: int
+) -> list[str]:
     """All that changes with time: goals, trails, robots, and below the map a line of progress and two counters."""
     loop = np.pad(solution.paths, ((pause_steps, pause_steps), (0, 0), (0, 0)), mode="edge")
     clock = svg.Clock(len(loop) - 1, step_seconds)
     steps = len(solution.paths) - 1
     step = np.clip(np.arange(len(loop)) - pause_steps, 0, steps)
-    on_goal = (loop == instance.goals).all(axis=2)
+    aims = np.broadcast_to(instance.goals, loop.shape)
+    if changing is not None:
+        aims = np.pad(changing, ((pause_steps, pause_steps), (0, 0), (0, 0)), mode="edge")
+    on_goal = (loop == aims).all(axis=2)
     resting = on_goal & np.concatenate([on_goal[1:], on_goal[-1:]])  # driving across a goal does not count
     over = [int(now == steps) for now in step]
     warning = _ring(0, 0, over[0], clock.sudden("stroke-opacity", over))
@@ -111,11 +121,20 @@ def _moving(instance: Instance, solution: Solution, step_seconds: float, pause_s
     colours = svg.colours(instance.num_agents)
     for i, colour in enumerate(colours):
         fill = resting[:, i].astype(int).tolist()
-        goals.append(_goal(i, instance.goals[i], colour, fill[0], clock.sudden("fill-opacity", fill)))
+        goal = _goal(i, instance.goals[i], colour, fill[0], clock.sudden("fill-opacity", fill))
+        shifts = [f"{x},{y}" for y, x in ((aims[:, i] - aims[0, i]) * _CELL).tolist()]
+        change = clock.sudden("transform", shifts, "animateTransform")
+        goals.append(f"<g>{goal}{change}</g>" if change else goal)
         trails.append(_trail(i, loop[:, i], colours, clock))
         drive = clock.smooth("transform", loop[:, i, ::-1] * _CELL, "animateTransform")
-        robots.append(_robot(i, loop[0, i], colour, drive if on_goal[-1, i] else warning + drive))
+        robots.append(
+            _robot(i, loop[0, i], colour, drive if changing is not None or on_goal[-1, i] else warning + drive)
+        )
 
+    told = [f"{count} of {len(robots)} on goal" for count in resting.sum(axis=1)]
+    if changing is not None:
+        reached, there = (loop[1:] == aims[:-1]).all(axis=2), (loop[:-1] == aims[:-1]).all(axis=2)
+        told = [f"{count} arrivals" for count in np.cumsum([0, *(reached & ~there).sum(axis=1)])]
     left, right = _span(instance)
     line = _caption_line(instance)
     bar = f'x="{left}" y="{line - 19}" height="3" rx="1.5"'
@@ -129,7 +148,7 @@ def _moving(instance: Instance, solution: Solution, step_seconds: float, pause_s
         f'<rect {bar} width="0" fill="{_FAINT_INK}">{growth}</rect>',
         f'<clipPath id="{window}"><rect x="{left}" y="{line - 15}" width="{right - left}" height="20"/></clipPath>',
         f'<g clip-path="url(#{window})">',
-        _counter(clock, [f"{count} of {len(robots)} on goal" for count in resting.sum(axis=1)], instance, "start"),
+        _counter(clock, told, instance, "start"),
         _counter(clock, [f"step {now} of {steps}" for now in step], instance, "end"),
         "</g>",
     ]
@@ -264,6 +283,23 @@ def require_title(title: str | None) -> None:
     """Raise TypeError if the title is no text."""
     if title is not None:
         arguments.instance_of(title, str, "title")
+
+
+def goals_over_time(instance: Instance, solution: Solution, goals: npt.ArrayLike) -> Cells:
+    """`goals` as cells (T + 1, N, 2) of the map, one for each cell of the solution's paths, the instance's goals first.
+
+    Raises:
+        ValueError: If they do not fit the paths, leave the map, or begin with other goals.
+        TypeError: If they are not integers.
+    """
+    found = arguments.cells(goals, "goals", "(T + 1, N, 2)", ": a goal of each agent at each time", filled=True)
+    if found.shape != solution.paths.shape:
+        raise ValueError(f"goals must have the shape of the paths, {solution.paths.shape}, got {found.shape}")
+    if not np.array_equal(found[0], instance.goals):
+        raise ValueError("goals must begin with those of the instance: give the instance that the episode began with")
+    if ((found < 0) | (found >= instance.grid.shape)).any():
+        raise ValueError("goals must lie on the map: give the instance that they are of")
+    return found
 
 
 def require_drawable(instance: Instance, solution: Solution) -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
+
+import numpy as np
+import numpy.typing as npt
 
 from mapf_env import arguments, rules, svg
 from mapf_env.config import EnvConfig
 from mapf_env.files import PathLike, write_whole
-from mapf_env.instance import Instance
-from mapf_env.render import require_drawable, require_title
+from mapf_env.instance import Cells, Instance
+from mapf_env.render import goals_over_time, require_drawable, require_title
 from mapf_env.solution import Solution
 
 
@@ -25,6 +28,8 @@ class Scene:
     """The map and the goals."""
     solutions: Mapping[str, Solution]
     """Paths (T + 1, N, 2) by the name above each; they need not solve the instance, nor be of equal length."""
+    goals: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
+    """Goals (T + 1, N, 2) at each time of a solution by its name, where they changed, as in lifelong tasks."""
 
 
 def replay(
@@ -34,6 +39,7 @@ def replay(
     *,
     title: str | None = None,
     config: EnvConfig | None = None,
+    goals: npt.ArrayLike | None = None,
 ) -> str:
     """The page; it needs no network. A click on a robot shows its field of view, its neighbours and its goal.
 
@@ -43,16 +49,19 @@ def replay(
         path: Where to write the page too, if anywhere.
         title: A line above the map.
         config: The settings whose fov_radius, comm_radius and comm_range are shown; the paper's if not given.
+        goals: The goals (T + 1, N, 2) at each time, `env.goals` after the reset and each step of a lifelong task; those
+            of the instance at all times if not given.
 
     Raises:
-        ValueError: If the paths are of another number of agents or leave the map.
+        ValueError: If the paths are of another number of agents or leave the map, or the goals do not belong to them.
         TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written.
     """
     require_drawable(instance, solution)
     require_title(title)
     title = title or f"{instance.num_agents} robots, {len(solution.paths) - 1} steps"
-    return replay_scenes([Scene("", instance, {"": solution})], path, title=title, config=config)
+    scene = Scene("", instance, {"": solution}, {} if goals is None else {"": goals})
+    return replay_scenes([scene], path, title=title, config=config)
 
 
 def replay_scenes(
@@ -67,8 +76,8 @@ def replay_scenes(
         config: The settings whose fov_radius, comm_radius and comm_range are shown; the paper's if not given.
 
     Raises:
-        ValueError: If there is no scene, one has no solution, or its paths are of another number of agents or leave
-            the map.
+        ValueError: If there is no scene, one has no solution, its paths are of another number of agents or leave the
+            map, or goals do not belong to a solution.
         TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written.
     """
@@ -96,6 +105,13 @@ def _plain(scene: Scene, config: EnvConfig) -> dict[str, object]:
     for name, solution in scene.solutions.items():
         arguments.instance_of(name, str, f"the name of a solution of the scene {scene.title!r}")
         require_drawable(scene.instance, solution)
+    unknown = arguments.instance_of(scene.goals, Mapping, f"the goals of the scene {scene.title!r}").keys()
+    unknown -= scene.solutions.keys()
+    if unknown:
+        raise ValueError(f"the scene {scene.title!r} has goals but no solution of the name {min(unknown)!r}")
+    changing = {
+        name: goals_over_time(scene.instance, scene.solutions[name], each) for name, each in scene.goals.items()
+    }
     radius = config.comm_radius
     if config.comm_range == "connected":
         radius = rules.connecting_radius(scene.instance.starts, radius)
@@ -105,5 +121,22 @@ def _plain(scene: Scene, config: EnvConfig) -> dict[str, object]:
         "goals": scene.instance.goals.tolist(),
         "comm_radius": min(radius, 1e9),
         "colours": svg.colours(scene.instance.num_agents),
-        "panels": [{"name": name, "paths": each.paths.tolist()} for name, each in scene.solutions.items()],
+        "panels": [
+            {
+                "name": name,
+                "paths": each.paths.tolist(),
+                "goals": _changes(changing[name]) if name in changing else None,
+            }
+            for name, each in scene.solutions.items()
+        ],
     }
+
+
+def _changes(goals: Cells) -> list[list[list[int]]]:
+    """For each robot its first goal and all later ones, each with its time: [time, row, column]."""
+    changed = np.ones(goals.shape[:2], np.bool_)
+    changed[1:] = np.any(goals[1:] != goals[:-1], axis=2)
+    return [
+        [[time, *goals[time, robot].tolist()] for time in np.flatnonzero(changed[:, robot]).tolist()]
+        for robot in range(goals.shape[1])
+    ]

@@ -26,3 +26,12 @@ def test_sound_files_pass_and_a_damaged_one_fails(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "two.map, line 5, column 2: unknown character 'x'" in done.stderr
     assert "1 files failed" in done.stderr
+
+
+def test_many_cases_on_one_map_are_timed() -> None:
+    program = f"import sys; sys.path.insert(0, {str(COMMAND.parent)!r}); import load_files; from pathlib import Path\n"
+    program += "import tempfile\nwith tempfile.TemporaryDirectory() as folder:\n"
+    program += "    load_files.many_cases(Path(folder), height=40, width=50, sets=3, scenarios=7)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert "3 instances: saved in" in done.stdout
+    assert "7 scenarios: loaded in" in done.stdout

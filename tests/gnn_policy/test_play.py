@@ -75,17 +75,6 @@ def test_robots_are_placed_on_a_map_by_the_seed(home):
     assert len(pages["a"]["scenes"][0]["goals"]) == 4
 
 
-def test_a_page_that_nobody_named_overwrites_nothing(home, capsys):
-    (home / "own.html").write_text("mine")
-    for expected in ("own-2.html", "own-3.html"):
-        played("own.scen", "--max-steps", "1")
-        assert f"replay: {expected}" in capsys.readouterr().out
-        assert shown(home / expected)["scenes"]
-    assert (home / "own.html").read_text() == "mine"
-    played("own.scen", "--max-steps", "1", "--out", "own.html")
-    assert shown(home / "own.html")["scenes"]
-
-
 def test_every_option_reaches_the_rollout(home, monkeypatch):
     asked = []
     monkeypatch.setattr(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapf_env import EnvConfig, Instance, Scene, Solution, random_instance, replay, replay_scenes
+from mapf_env import BatchedEnv, EnvConfig, Instance, Scene, Solution, animate, random_instance, replay, replay_scenes
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -164,3 +164,78 @@ def test_the_page_is_self_contained_and_no_text_ends_its_script(tmp_path: Path) 
     assert "http" not in page
     with pytest.raises(ValueError, match="the solution has 1 paths, the instance 2 agents"):
         replay(instance, Solution(np.zeros((1, 1, 2), int)))
+
+
+def lifelong_episode() -> tuple[Instance, Solution, np.ndarray, int]:
+    """An episode with its goals at each time, and how often robots arrived."""
+    env = BatchedEnv(1, num_agents=3, height=4, width=5, density=0.0, task="lifelong", max_cycles=60)
+    env.reset(seed=4)
+    instance = Instance(env.grids[0], env.positions[0], env.goals[0])
+    paths, goals, arrivals, generator = [env.positions[0]], [env.goals[0]], 0, np.random.default_rng(0)
+    for _ in range(60):
+        step = env.step(generator.integers(0, 5, (1, 3)))
+        arrivals += int(step.arrived.sum())
+        paths.append(env.positions[0])
+        goals.append(env.goals[0])
+    return instance, Solution(np.stack(paths)), np.stack(goals), arrivals
+
+
+NODE = shutil.which("node")
+
+
+def test_lifelong_episodes_show_the_goals_of_each_time() -> None:
+    instance, solution, goals, arrivals = lifelong_episode()
+    assert arrivals > 3
+    page = replay(instance, solution, goals=goals)
+    (panel,) = json.loads(re.findall(r"^const data = (.*);$", page, re.MULTILINE)[0])["scenes"][0]["panels"]
+    for robot, changes in enumerate(panel["goals"]):
+        times = [time for time, *_ in changes]
+        assert times == sorted(set(times))
+        for time, aims in enumerate(goals[:, robot].tolist()):
+            assert next(cell for begun, *cell in reversed(changes) if begun <= time) == aims
+    if NODE:
+        functions = re.findall(r"^function (?:goal|arrivals)\(.*?^}$", page, re.MULTILINE | re.DOTALL)
+        assert len(functions) == 2
+        program = "\n".join(
+            [
+                *functions,
+                f"const paths = {json.dumps(panel['paths'])}, goals = {json.dumps(panel['goals'])};",
+                "const seen = paths.map((_, t) => paths[0].map((_, i) => goal({goals}, i, t)));",
+                "console.log(JSON.stringify([seen, arrivals(paths, goals)]));",
+            ]
+        )
+        done = subprocess.run([NODE, "-e", program], capture_output=True, text=True, check=True)
+        seen, counts = json.loads(done.stdout)
+        assert seen == goals.tolist()
+        assert (len(counts), counts[0], counts[-1]) == (61, 0, arrivals)
+    picture = animate(instance, solution, goals=goals)
+    assert f">{arrivals} arrivals</tspan>" in picture
+    assert picture.count('<animateTransform attributeName="transform" type="translate" calcMode="discrete"') > 3
+    assert 'class="lost"' not in picture, "nobody is late where goals go on"
+
+
+def test_scenes_may_have_goals_that_change_for_some_of_their_solutions() -> None:
+    instance, solution, goals, _ = lifelong_episode()
+    scene = Scene("both", instance, {"still": solution, "going on": solution}, {"going on": goals})
+    page = replay_scenes([scene], title="two")
+    panels = json.loads(re.findall(r"^const data = (.*);$", page, re.MULTILINE)[0])["scenes"][0]["panels"]
+    assert panels[0]["goals"] is None
+    assert [changes[0] for changes in panels[1]["goals"]] == [[0, *goal] for goal in instance.goals.tolist()]
+
+
+def test_goals_of_another_episode_are_refused() -> None:
+    instance, solution, goals, _ = lifelong_episode()
+    outside = goals.copy()
+    outside[3, 1] = 4, 0
+    for wrong, said in (
+        (goals[:-1], r"goals must have the shape of the paths, \(61, 3, 2\), got \(60, 3, 2\)"),
+        (goals[::-1], "goals must begin with those of the instance"),
+        (outside, "goals must lie on the map"),
+    ):
+        for show in (replay, animate):
+            with pytest.raises(ValueError, match=said):
+                show(instance, solution, goals=wrong)
+    with pytest.raises(TypeError, match="goals must be integers"):
+        replay(instance, solution, goals=goals.astype(float))
+    with pytest.raises(ValueError, match="has goals but no solution of the name 'b'"):
+        replay_scenes([Scene("x", instance, {"a": solution}, {"b": goals})], title="x")
