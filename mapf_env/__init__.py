@@ -27,7 +27,7 @@ from mapf_env.pogema_maps import PogemaMap, load_pogema_maps, parse_pogema_map
 from mapf_env.render import animate, draw
 from mapf_env.replay import Scene, replay, replay_scenes
 from mapf_env.rewards import SCHEMES, Rewards
-from mapf_env.rules import Edges, communication_edges, communication_graph
+from mapf_env.rules import Edges, communication_edges, communication_graph, distances
 from mapf_env.senses import HISTORY, CommRange, CommWeights, Senses
 from mapf_env.solution import MOVES, Action, Conflict, Solution
 
@@ -63,6 +63,7 @@ __all__ = [
     "animate",
     "communication_edges",
     "communication_graph",
+    "distances",
     "draw",
     "env",
     "instance_hash",

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 
 from mapf_env import _native, arguments, rules
-from mapf_env.config import EnvConfig
+from mapf_env.config import EnvConfig, configured
 from mapf_env.instance import Instance
 from mapf_env.instance_source import InstanceSource
 from mapf_env.perception import Bag, States
@@ -71,7 +71,8 @@ class BatchedEnv:
         autoreset: As in Gymnasium: DISABLED; NEXT_STEP, the step after the end ignores the actions, which must be valid
             all the same, and begins the next episode; or SAME_STEP, the step that ends returns the first observation of
             the next episode, and `Step.final_observation` has the last ones of those that ended.
-        cases: Instances to play, drawn anew at each reset by the seed, in place of random ones.
+        cases: Instances to play, drawn at each reset by the seed, instead of random ones.
+        grid: The map (H, W) of all episodes, True is an obstacle; starts and goals are drawn. It sets height and width.
         fill: Take instances that are smaller than the environment too: the map is filled up with obstacles, and the
             robots that are not there have zeros everywhere, but for the action mask, which leaves them idle, so that a
             masked choice is always defined; `present` says which are there.
@@ -89,6 +90,7 @@ class BatchedEnv:
         threads: int = 1,
         autoreset: AutoresetMode = AutoresetMode.DISABLED,
         cases: Iterable[Instance] | None = None,
+        grid: npt.ArrayLike | None = None,
         fill: bool = False,
         **settings: Any,
     ) -> None:
@@ -99,8 +101,8 @@ class BatchedEnv:
         except ValueError:
             modes = ", ".join(f"AutoresetMode.{mode.name}" for mode in AutoresetMode)
             raise ValueError(f"autoreset must be one of {modes}, got {autoreset!r}") from None
-        self.config = config = EnvConfig(**settings)
-        self._source = InstanceSource(config, cases, fill)
+        self.config = config = configured(settings, ("threads", "autoreset", "cases", "grid", "fill"), grid)
+        self._source = self._home = InstanceSource(config, cases, grid, fill)
         teams = (num_envs, config.num_agents)
         self._fov_shape = (*teams, config.num_channels, config.fov_side, config.fov_side)
         self._graph_shape = (*teams, config.num_agents)
@@ -118,9 +120,13 @@ class BatchedEnv:
         if shape == (self.config.height, self.config.width):
             return self
         settings = {each.name: getattr(config, each.name) for each in fields(config)}
-        if shape != (config.height, config.width):
+        home = shape == (config.height, config.width)
+        if not home:
             settings |= {"height": shape[0], "width": shape[1], "density": 0.0, "style": "empty"}
         other = BatchedEnv(self.num_envs, threads=self.threads, autoreset=self.autoreset, **settings)
+        other._home = self._home
+        if home:
+            other._source = self._home
         for name in ("streams", "episodes", "started"):
             getattr(other._state, name)[:] = getattr(self._state, name)
         return other

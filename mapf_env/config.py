@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from typing import Any, Literal, get_args
+
+import numpy.typing as npt
 
 from mapf_env import arguments
 from mapf_env.generation import Style, check_map, style_name
+from mapf_env.instance import as_obstacles
 from mapf_env.rewards import SCHEMES, Rewards
 from mapf_env.senses import Senses, require_bytes
 
@@ -79,3 +84,31 @@ class EnvConfig(Senses):
     def needs_distances(self) -> bool:
         """True if the environment keeps every robot's distances to its goal."""
         return self.needs_map or self.rewards.closer != 0.0
+
+
+def configured(settings: dict[str, Any], options: Iterable[str], grid: npt.ArrayLike | None) -> EnvConfig:
+    """The configuration of an environment by its keyword arguments.
+
+    Args:
+        settings: Fields of `EnvConfig`.
+        options: The other keyword arguments of the environment, for the message.
+        grid: The map (H, W) that it has, if that is given; it sets the height and the width.
+
+    Raises:
+        TypeError: If a setting is unknown; the message lists those that exist.
+        ValueError: If a setting is out of range or contradicts the map.
+    """
+    known = [each.name for each in fields(EnvConfig)]
+    for name in settings:
+        if name not in known:
+            every = sorted([*known, *options])
+            near = get_close_matches(name, every, 1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise TypeError(f"there is no setting {name!r}: {hint}The settings are {', '.join(every)}")
+    if grid is None:
+        return EnvConfig(**settings)
+    for name, length in zip(("height", "width"), as_obstacles(grid).shape, strict=True):
+        if settings.get(name, length) != length:
+            raise ValueError(f"the grid has a {name} of {length}, got {name}={settings[name]}: leave out {name}")
+        settings = settings | {name: length}
+    return EnvConfig(**{"density": 0.0, "style": "empty", **settings})

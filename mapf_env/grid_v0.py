@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 
 from mapf_env import _native, arguments, rules
 from mapf_env.batched_env import BatchedEnv, Observation
-from mapf_env.config import EnvConfig
+from mapf_env.config import EnvConfig, configured
 from mapf_env.instance import Instance
 from mapf_env.pixels import RENDER_MODES, RenderMode, Screen
 
@@ -37,6 +38,8 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
             nothing.
         render_mode: "ansi" gives text, "rgb_array" a picture (H', W', 3), "human" prints the text at each step; in a
             terminal each state replaces the one before, `metadata["render_fps"]` times a second.
+        cases: As in `BatchedEnv`.
+        grid: As in `BatchedEnv`.
         settings: Fields of `mapf_env.EnvConfig`.
     """
 
@@ -54,13 +57,16 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         preferences: bool = False,
         reuse_buffers: bool = False,
         render_mode: RenderMode | None = None,
+        cases: Iterable[Instance] | None = None,
+        grid: npt.ArrayLike | None = None,
         **settings: Any,
     ) -> None:
         arguments.choice(observation, ("dict", "box"), "observation")
         arguments.flag(preferences, "preferences")
         arguments.flag(reuse_buffers, "reuse_buffers")
-        self.config = config = EnvConfig(**settings)  # which has none of the options of a batch alone
-        self._batch = BatchedEnv(1, **settings)
+        options = ("observation", "preferences", "reuse_buffers", "render_mode", "cases", "grid")
+        self.config = config = configured(settings, options, grid)  # which refuses the options of a batch alone
+        self._batch = BatchedEnv(1, cases=cases, grid=grid, **settings)
         if preferences and config.shield != "pibt":
             raise ValueError('preferences over all five moves need shield="pibt"')
         self._observation, self._preferences, self._reuse = observation, preferences, reuse_buffers

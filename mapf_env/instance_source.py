@@ -11,7 +11,7 @@ import numpy.typing as npt
 from mapf_env import _native, arguments
 from mapf_env.config import EnvConfig
 from mapf_env.generation import random_cases, random_maps
-from mapf_env.instance import Instance
+from mapf_env.instance import Instance, as_obstacles
 
 
 class Problems(NamedTuple):
@@ -32,27 +32,37 @@ class InstanceSource:
 
     Args:
         config: Says how large they are, and what random ones are like.
-        cases: Instances to draw from, in place of random ones.
+        cases: Instances to draw from, instead of random ones.
+        grid: The map (H, W) of random ones, of the size that the configuration says.
         fill: Take smaller instances too: the map is filled up with obstacles, and robots are missing.
 
     Raises:
-        ValueError: If there are no cases, or one does not fit.
-        TypeError: If the cases are no instances.
+        ValueError: If there are no cases, one does not fit, or the map has no room for the robots.
+        TypeError: If the cases are not instances.
     """
 
-    def __init__(self, config: EnvConfig, cases: Iterable[Instance] | None, fill: bool) -> None:
+    def __init__(
+        self, config: EnvConfig, cases: Iterable[Instance] | None, grid: npt.ArrayLike | None, fill: bool
+    ) -> None:
         self._config, self._fill = config, arguments.flag(fill, "fill")
+        self._grid = None if grid is None else as_obstacles(grid)
+        if grid is not None and cases is not None:
+            raise ValueError("cases bring maps of their own: give cases or a grid, not both")
         self._cases = None if cases is None else list(arguments.each_of(cases, Instance, "cases"))
         if self._cases is not None and not len(self.stack(self._cases, "cases").grids):
             raise ValueError("there are no cases to play: give some, or None for random instances")
+        if self._grid is not None:
+            self.draw(np.zeros(1, np.uint64))  # raises if the map has no room
 
     def draw(self, seeds: npt.NDArray[np.uint64]) -> Problems:
         """One problem for each seed."""
         if self._cases is None:
             config, count = self._config, len(seeds)
-            grids = random_maps(
-                seeds, height=config.height, width=config.width, density=config.density, style=config.style
-            )
+            if self._grid is None:
+                size = {"height": config.height, "width": config.width}
+                grids = random_maps(seeds, **size, density=config.density, style=config.style)
+            else:
+                grids = np.repeat(self._grid[None], count, axis=0)
             starts, goals = random_cases(seeds, grids, config.num_agents)
             return Problems(grids, starts, goals, np.full(count, config.num_agents, np.int32))
         draws = _native.mix(seeds, np.full_like(seeds, np.iinfo(np.uint64).max)) % np.uint64(len(self._cases))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import gymnasium
@@ -11,8 +12,9 @@ from gymnasium import spaces
 
 from mapf_env import arguments
 from mapf_env.batched_env import BatchedEnv, Observation
-from mapf_env.config import EnvConfig
+from mapf_env.config import configured
 from mapf_env.grid_v0 import begun, instance_asked_for, observation_spaces
+from mapf_env.instance import Instance
 from mapf_env.pixels import RENDER_MODES, RenderMode, Screen
 
 
@@ -25,14 +27,23 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
 
     Args:
         render_mode: As in `GridEnv`.
+        cases: As in `BatchedEnv`.
+        grid: As in `BatchedEnv`.
         settings: Fields of `mapf_env.EnvConfig`.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 4}  # noqa: RUF012
 
-    def __init__(self, *, render_mode: RenderMode | None = None, **settings: Any) -> None:
-        self.config = config = EnvConfig(**settings)  # which has none of the options of a batch alone
-        self._batch = BatchedEnv(1, **settings)
+    def __init__(
+        self,
+        *,
+        render_mode: RenderMode | None = None,
+        cases: Iterable[Instance] | None = None,
+        grid: npt.ArrayLike | None = None,
+        **settings: Any,
+    ) -> None:
+        self.config = config = configured(settings, ("render_mode", "cases", "grid"), grid)
+        self._batch = BatchedEnv(1, cases=cases, grid=grid, **settings)
         self.render_mode = render_mode
         self._screen = Screen(render_mode, self.metadata["render_fps"])
         N = config.num_agents

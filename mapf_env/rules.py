@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mapf_env import _native, arguments
+from mapf_env.instance import as_obstacles
 from mapf_env.senses import CommWeights
 
 Positions = npt.NDArray[np.int32]
@@ -55,6 +56,16 @@ def observe(
         out = np.empty((*positions.shape[:2], 3, side, side), obstacles.dtype)
     _native.observe(obstacles, fov_radius, positions, goals, fov_radius, out)
     return out
+
+
+def distances(grid: npt.ArrayLike, cells: npt.ArrayLike) -> npt.NDArray[np.int32]:
+    """Steps from each cell of a map (H, W) to each of M cells (M, 2), as (M, H, W); -1 where there is no way.
+
+    Raises:
+        ValueError: If a shape is wrong or a cell lies off the map.
+        TypeError: If the grid holds neither bool nor 0 and 1, or cells are not integers.
+    """
+    return _native.distances(as_obstacles(grid), arguments.cells(cells, "cells", "(M, 2)"))
 
 
 def distance_tables(obstacles: Bordered, fov_radius: int, goals: npt.ArrayLike) -> npt.NDArray[np.uint16]:

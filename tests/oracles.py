@@ -177,3 +177,11 @@ def arrival(path: Sequence[Cell]) -> int:
     while time > 0 and path[time - 1] == path[-1]:
         time -= 1
     return time
+
+
+def mixed(seed: int, counter: int) -> int:
+    """The draw number `counter` of SplitMix64 from `seed`."""
+    word = (seed + (counter + 1) * 0x9E3779B97F4A7C15) % 2**64
+    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+    word = (word ^ word >> 27) * 0x94D049BB133111EB % 2**64
+    return word ^ word >> 31

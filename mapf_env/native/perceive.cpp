@@ -86,12 +86,6 @@ void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& 
     const std::size_t count = states.size(), R = states.positions.shape(0), num_maps = maps.offsets.shape(0);
     require(maps.pad >= senses.fov_radius, "the maps need a border of at least fov_radius: make the MapSet with a larger one");
     require(maps.sizes.shape(0) == num_maps && maps.sizes.shape(1) == 2, "give a height and width for each map");
-    for (std::size_t m = 0; m < num_maps; ++m) {
-        const std::int64_t height = maps.sizes(m, 0), width = maps.sizes(m, 1), border = 2 * maps.pad;
-        require(height > 0 && width > 0 && maps.offsets(m) >= 0 &&
-                    maps.offsets(m) + (height + border) * (width + border) <= static_cast<std::int64_t>(maps.cells.size()),
-                "the maps do not fit into their memory");
-    }
     require(states.offsets.shape(0) == count + 1 && states.offsets(0) == 0, "offsets must have shape (T + 1,) and begin with 0");
     for (std::size_t t = 0; t < count; ++t)
         if (states.offsets(t + 1) < states.offsets(t)) fail("offsets must not fall, as they do after team " + std::to_string(t));
@@ -104,19 +98,28 @@ void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& 
     require(states.seeds.shape(0) == count && states.times.shape(0) == count && states.limits.shape(0) == count &&
                 states.comm_radius.shape(0) == count,
             "seeds, times, limits and comm_radius must have shape (T,)");
-    for (std::size_t i = 0; i < states.moves.size(); ++i)
-        if (states.moves.data()[i] < -1 || states.moves.data()[i] >= num_actions)
-            fail("moves must lie in -1..4, got " + std::to_string(states.moves.data()[i]) + " for robot " +
-                 std::to_string(i / history));
+    const std::int8_t* const moves = states.moves.data();
+    const auto is_none = [](std::int8_t move) { return static_cast<std::uint8_t>(move + 1) > num_actions; };
+    bool any = false;
+    for (std::size_t i = 0; i < states.moves.size(); ++i) any |= is_none(moves[i]);
+    if (any) {
+        const auto i = static_cast<std::size_t>(std::find_if(moves, moves + states.moves.size(), is_none) - moves);
+        fail("moves must lie in -1..4, got " + std::to_string(moves[i]) + " for robot " + std::to_string(i / history));
+    }
     std::vector<std::uint8_t> taken;
     for (std::size_t t = 0; t < count; ++t) {
-        const std::string where = " of team " + std::to_string(t);
+        const auto where = [t] { return " of team " + std::to_string(t); };
         if (static_cast<std::uint32_t>(states.maps(t)) >= num_maps)
-            fail("the map" + where + " is number " + std::to_string(states.maps(t)) + ", but there are " +
+            fail("the map" + where() + " is number " + std::to_string(states.maps(t)) + ", but there are " +
                  std::to_string(num_maps) + " maps");
-        if (states.limits(t) < 1) fail("the limit" + where + " must be at least 1");
-        if (!(states.comm_radius(t) >= 0.0)) fail("the comm_radius" + where + " must not be negative");
+        if (states.limits(t) < 1) fail("the limit" + where() + " must be at least 1");
+        if (!(states.comm_radius(t) >= 0.0)) fail("the comm_radius" + where() + " must not be negative");
         const Layout layout = maps.layout(states.maps(t));
+        const std::int64_t first_cell = maps.offsets(states.maps(t)), border = 2 * maps.pad;
+        require(layout.height > 0 && layout.width > 0 && first_cell >= 0 &&
+                    first_cell + (layout.height + border) * (layout.width + border) <=
+                        static_cast<std::int64_t>(maps.cells.size()),
+                "the maps do not fit into their memory");
         const T* obstacles = maps.obstacles(states.maps(t));
         taken.resize(std::max<std::size_t>(taken.size(), layout.size()), 0);
         const std::size_t first = states.offsets(t), n = states.robots(t);
@@ -124,7 +127,7 @@ void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& 
             const char* what = cells == &states.goals ? "the goal of robot " : "robot ";
             for (std::size_t i = 0; i < n; ++i) {
                 const std::int32_t* cell = cells->data() + 2 * (first + i);
-                const auto text = [&] { return what + std::to_string(i) + where + " at " + cell_text(cell); };
+                const auto text = [&] { return what + std::to_string(i) + where() + " at " + cell_text(cell); };
                 if (!layout.contains(cell[0], cell[1])) fail(text() + " lies outside the map");
                 if (obstacles[layout.cell(cell[0], cell[1])] != T{0}) fail(text() + " lies on an obstacle");
             }
@@ -132,7 +135,7 @@ void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& 
         for (std::size_t i = 0; i < n; ++i) {
             const std::int32_t* cell = states.positions.data() + 2 * (first + i);
             std::uint8_t& here = taken[layout.cell(cell[0], cell[1])];
-            if (here) fail("two robots" + where + " stand at " + cell_text(cell));
+            if (here) fail("two robots" + where() + " stand at " + cell_text(cell));
             here = 1;
         }
         for (std::size_t i = 0; i < n; ++i)

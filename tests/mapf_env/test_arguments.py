@@ -142,6 +142,7 @@ CALLS: dict[str, Any] = {
             "threads": (*COUNT, 1025),
             "autoreset": WORD,
             "cases": (*but(SEVERAL, NoneType), [], INSTANCE),
+            "grid": (*but(ARRAY, NoneType), GRID[0], np.full((4, 4), 2)),
             "fill": FLAG,
         },
     ),
@@ -248,6 +249,11 @@ CALLS: dict[str, Any] = {
         mapf_env.communication_edges,
         {"graph": np.ones((1, 2, 2), np.float32), "positions": INSTANCE.starts[None]},
         {"graph": (*ARRAY, np.ones((2, 2)), np.ones((1, 3, 3))), "positions": (*ARRAY, INSTANCE.starts)},
+    ),
+    "distances": (
+        mapf_env.distances,
+        {"grid": GRID, "cells": INSTANCE.starts},
+        {"grid": (*ARRAY, np.full((4, 4), 2)), "cells": (*ARRAY, [[9, 9]])},
     ),
     "animate": (
         mapf_env.animate,

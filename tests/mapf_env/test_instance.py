@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import oracles
 import strategies
-from mapf_env import Instance, _native
+from mapf_env import Instance, _native, distances
 
 OPEN = np.zeros((3, 3), bool)
 
@@ -123,7 +123,7 @@ def test_unreachable_positions_are_refused_by_at_as_well(instance: Instance) -> 
 @given(strategies.grids())
 def test_native_distances_and_regions_agree_with_search_in_python(grid: oracles.Grid) -> None:
     free = sorted(oracles.free_cells(grid))
-    tables = _native.distances(grid, np.array(free, np.int32))
+    tables = distances(grid, np.array(free, np.int32))
     labels = _native.regions(grid)
     assert (labels == -1).tolist() == grid.tolist()
     assert labels.max() + 1 == len(oracles.regions(grid))
@@ -145,7 +145,7 @@ def test_native_distances_on_maps_of_all_widths(shape: tuple[int, int], density:
     grid[0, 0] = False
     free = np.argwhere(~grid).astype(np.int32)
     cells = random.permutation(free)[:3]
-    for cell, table in zip(cells, _native.distances(grid, cells), strict=True):
+    for cell, table in zip(cells, distances(grid, cells), strict=True):
         steps = oracles.distances(grid, (int(cell[0]), int(cell[1])))
         expected = np.full(shape, -1)
         for (row, col), distance in steps.items():

@@ -183,17 +183,9 @@ def goal_direction(world: World, receiver: int, sender: int) -> list[float]:
     return [part / max(math.dist(world.goals[sender], world.team[sender]), 1) for part in way]
 
 
-def mixed(seed: int, counter: int) -> int:
-    """SplitMix64's draw number `counter`."""
-    word = (seed + (counter + 1) * 0x9E3779B97F4A7C15) % 2**64
-    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 % 2**64
-    word = (word ^ word >> 27) * 0x94D049BB133111EB % 2**64
-    return word ^ word >> 31
-
-
 def priority(world: World, receiver: int, sender: int) -> list[float]:
-    key = mixed(world.seed, 3)
-    order = sorted(range(len(world.team)), key=lambda i: (-world.under_way[i], mixed(key, i) >> 32, i))
+    key = oracles.mixed(world.seed, 3)
+    order = sorted(range(len(world.team)), key=lambda i: (-world.under_way[i], oracles.mixed(key, i) >> 32, i))
     return [order.index(sender) < order.index(receiver)]
 
 
