@@ -129,9 +129,3 @@ def test_an_unknown_setting_is_refused_with_the_nearest_one_and_all_that_exist(m
         make(fov_radios=3)
     with pytest.raises(TypeError, match=r"there is no setting 'xyz': The settings are .*cases, .*, grid, .*, width"):
         make(xyz=3)
-
-
-def test_the_options_of_a_batch_are_not_settings_of_one_team() -> None:
-    for make in (parallel_env, env, joint_env):
-        with pytest.raises(TypeError, match="there is no setting 'threads'"):
-            make(threads=2)

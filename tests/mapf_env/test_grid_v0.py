@@ -210,7 +210,7 @@ def test_bad_calls_are_refused() -> None:
 
 @pytest.mark.parametrize("make", [parallel_env, mapf_env.env, mapf_env.joint_env])
 @pytest.mark.parametrize(
-    "option", [{"autoreset": AutoresetMode.SAME_STEP}, {"fill": True}, {"cases": []}, {"threads": 2}]
+    "option", [{"autoreset": AutoresetMode.SAME_STEP}, {"fill": True}, {"num_envs": 1}, {"threads": 2}]
 )
 def test_what_only_a_batch_has_is_refused(make: Any, option: dict[str, Any]) -> None:
     with pytest.raises(TypeError, match=next(iter(option))):
