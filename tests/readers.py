@@ -1,4 +1,4 @@
-"""What every reader of files promises, whatever the bytes: an instance or map, or an error that says where.
+"""What every reader of files promises, whatever the bytes: an instance, map or paths, or an error that says where.
 
 Run as a script this is a target for coverage-guided fuzzing, which needs `pip install atheris`:
     python tests/readers.py -max_total_time=300
@@ -21,10 +21,13 @@ import numpy as np
 GRID = [[0, 0, 1, 0], [0, 0, 0, 1], [1, 1, 0, 0]]
 MAP = b"type octile\nheight 3\nwidth 4\nmap\n..@.\nGS.T\nOW..\n"
 SCEN = b"version 1\n0\ta.map\t4\t3\t0\t0\t2\t1\t2.41421356\n1\ta.map\t4\t3\t1\t1\t3\t2\t2.41421356\n"
+PATHS = b"Agent 0: (1,0)->(1,1)->(0,1)->\nAgent 1: (2,2)->\n"
+LOG = b"agents=2\nsolved=1\nstarts=(0,1),(2,2),\nsolution=\n0:(0,1),(2,2),\n1:(1,1),(2,2),\n"
 YAML = b"'one': |-\n  @.!\n  $#.\n# marked\ntwo: |\n    aB.\n    #bA\n"
 
 atheris: Any = importlib.import_module("atheris") if __name__ == "__main__" else None
-with atheris.instrument_imports(include=["mapf_env"]) if atheris else nullcontext():
+with atheris.instrument_imports(include=["mapf_env", "experts"]) if atheris else nullcontext():
+    import experts
     import mapf_env
 
 Reader = Callable[[Path], Any]
@@ -33,11 +36,15 @@ READERS: dict[str, Reader] = {
     "scen": mapf_env.load_scen,
     "json": mapf_env.load_instances,
     "yaml": lambda path: [each.grid for each in mapf_env.load_pogema_maps(path).values()],
+    "paths": experts.load_paths,
+    "log": experts.load_paths,
 }
 WHERE = {
     "map": r"line \d+",
     "scen": r"line (\d+|i \+ 2)",
     "yaml": r"line \d+",
+    "paths": r"line \d+|holds no paths|table of",
+    "log": r"line \d+|holds no paths|table of",
     "json": r"line \d+ column \d+|(map|instance) \d+|expected|position \d+|recursion|digits",
 }
 """How the message of an error names the place, for each kind of file."""
@@ -47,7 +54,14 @@ def samples(folder: Path) -> dict[str, bytes]:
     """A sound file of each kind."""
     instance = mapf_env.Instance(GRID, [(0, 0), (1, 1)], [(1, 2), (2, 3)])
     mapf_env.save_instances(folder / "sample", [instance, instance.at([(1, 0), (0, 1)])])
-    return {"map": MAP, "scen": SCEN, "json": (folder / "sample").read_bytes(), "yaml": YAML}
+    return {
+        "map": MAP,
+        "scen": SCEN,
+        "json": (folder / "sample").read_bytes(),
+        "yaml": YAML,
+        "paths": PATHS,
+        "log": LOG,
+    }
 
 
 def faults(kind: str, content: bytes, folder: Path) -> list[str]:
@@ -67,7 +81,9 @@ def faults(kind: str, content: bytes, folder: Path) -> list[str]:
 
 
 def unsound(found: Any) -> list[str]:
-    """What is wrong with a map or an instance that a reader has accepted."""
+    """What is wrong with a map, an instance or paths that a reader has accepted."""
+    if isinstance(found, mapf_env.Solution):
+        return [] if (found.paths >= 0).all() and found.paths.ndim == 3 else ["these are no paths"]
     if isinstance(found, np.ndarray):
         return [] if found.dtype == np.bool_ and found.ndim == 2 and found.size else ["this is no map"]
     if not isinstance(found, mapf_env.Instance):

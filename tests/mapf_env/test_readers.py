@@ -19,6 +19,7 @@ TOKENS = [
         * 300
         + b' [ ] { } , : " null true '
         b"one: |- $ ! ' a A # "
+        b"Agent 0: 1: -> (0,0)-> (1,1), (123456789,2)-> ( , ) solution= "
         b"[] [[0,0]] [[0.5,0]] [[1,2,3]] {} starts goals sha256 maps instances [[9223372036854775808,0]]"
     ).split(b" "),
 ]
