@@ -9,12 +9,14 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import sys
 from itertools import cycle
 from typing import Any
 
-from pogema import GridConfig, pogema_v0  # pyright: ignore[reportMissingImports]
+sys.path.append(sys.path.pop(0))  # the package comes before pogema.py in this folder
 
 from cpu_clock import calls_per_second
+from pogema import GridConfig, pogema_v0  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def main() -> None:

@@ -18,6 +18,7 @@ from mapf_env.perception import Bag, States
 from mapf_env.team_state import TeamState
 
 _FLOAT = np.dtype(np.float32)
+_NO_WAY = np.iinfo(np.uint16).max
 
 
 class Observation(NamedTuple):
@@ -342,6 +343,52 @@ class BatchedEnv:
             state.arrived.copy(),
             final,
         )
+
+    def assign_goals(self, goals: npt.ArrayLike) -> None:
+        """Give robots other goals between two steps, as a dispatcher of tasks does; `observe` then shows them.
+
+        In lifelong tasks these goals replace those that the environment has drawn for robots that have arrived. Two
+        robots may have the same goal.
+
+        Args:
+            goals: (B, N, 2) the goals of all robots; those of absent robots are ignored.
+
+        Raises:
+            ValueError: If the shape is wrong, or a goal is not a free cell that its robot can reach.
+            TypeError: If the goals are not integers.
+            RuntimeError: Before the first reset.
+        """
+        if not self.began:
+            raise RuntimeError("there are no robots before the first reset: call reset()")
+        state = self._state
+        wanted = arguments.cells(goals, "goals", "(B, N, 2)")
+        if wanted.shape != state.goals.shape:
+            raise ValueError(f"goals must have shape {state.goals.shape}, got {wanted.shape}")
+        changed = self.present & (wanted != state.goals).any(axis=2)
+        teams = np.flatnonzero(changed.any(axis=1))
+        tables = [self._distances_to(int(b), np.flatnonzero(changed[b]), wanted[b]) for b in teams]
+        for b, table in zip(teams, tables, strict=True):
+            state.goals[b, changed[b]] = wanted[b, changed[b]]
+            if state.distances.size:
+                state.distances[b, changed[b]] = table
+        state.on_goal[changed] = (state.positions == state.goals).all(axis=2)[changed]
+
+    def _distances_to(self, b: int, robots: npt.NDArray[np.intp], goals: npt.NDArray[np.int32]) -> npt.NDArray[Any]:
+        """Tables of steps (K, size) to the goals of K robots of team b, which must be free and within reach."""
+        state, border = self._state, self.config.fov_radius
+        height, width = state.grids.shape[1:]
+        for robot in robots.tolist():
+            row, col = goals[robot].tolist()
+            if not (0 <= row < height and 0 <= col < width) or state.grids[b, row, col]:
+                raise ValueError(f"the goal ({row}, {col}) of agent {robot} in environment {b} is not a free cell")
+        table = rules.distance_tables(state.obstacles[b : b + 1], border, goals[None, robots])[0]
+        here = state.positions[b, robots] + border
+        lost = np.flatnonzero(table[np.arange(len(robots)), here[:, 0] * (width + 2 * border) + here[:, 1]] == _NO_WAY)
+        if len(lost):
+            robot = int(robots[lost[0]])
+            row, col = goals[robot].tolist()
+            raise ValueError(f"agent {robot} in environment {b} cannot reach the goal ({row}, {col}) from where it is")
+        return table
 
     def advance(self, actions: npt.NDArray[Any], out: Observation | None) -> Observation | None:
         """`step` without copies of the outcome, which stands in the state; returns the final observation."""

@@ -75,6 +75,36 @@ class PogemaMap:
             raise ValueError(f"POGEMA places at most {room} robots on this map: {count} are too many")
         return Instance(self.grid, starts[:count], goals[:count])
 
+    def goal_sequences(self, num_agents: int, seed: int, length: int) -> Cells:
+        """Return the goals (N, length, 2) that POGEMA 1.4 gives each robot of `instance` in turn in lifelong play.
+
+        Each robot draws from its own stream: uniformly from the marked goal cells, on other maps from all cells of its
+        region, and again while the draw is the goal that it has just reached. Robots may share a goal.
+
+        Raises:
+            ValueError: If an instance is impossible, or a robot has only one cell to go to.
+        """
+        instance = self.instance(num_agents, seed)
+        steps = arguments.integer(length, "length", 1, arguments.MOST_INT)
+        rng = np.random.default_rng(seed)
+        streams = rng.integers(np.iinfo(np.int32).max, size=num_agents)
+        choices = self._goal_choices(instance, seed)
+        sequences = [
+            _sequence(np.random.default_rng(stream), cells, goal, steps)
+            for stream, cells, goal in zip(streams.tolist(), choices, instance.goals, strict=True)
+        ]
+        return np.stack(sequences)
+
+    def _goal_choices(self, instance: Instance, seed: int) -> list[Cells]:
+        """The cells (M, 2) among which each robot draws its goals, in POGEMA's order."""
+        if self.marked:
+            rng = np.random.default_rng(seed)
+            _shuffled(rng, self.start_cells)
+            return [np.array(_shuffled(rng, self.goal_cells), np.int32)] * instance.num_agents
+        regions = _native.regions(self.grid)
+        cells = {region: np.argwhere(regions == region).astype(np.int32) for region in np.unique(regions).tolist()}
+        return [cells[int(regions[tuple(start)])] for start in instance.starts]
+
 
 def parse_pogema_map(drawing: str) -> PogemaMap:
     """Read one map drawn as text; blank lines, and spaces at the ends of lines, are ignored.
@@ -196,3 +226,16 @@ def _pairs(
             waiting[region] = len(starts)
             starts.append(cell)
     return [starts[robot] for robot in sorted(goals)], [goals[robot] for robot in sorted(goals)]
+
+
+def _sequence(rng: np.random.Generator, cells: Cells, goal: Cells, length: int) -> Cells:
+    """Draws from the cells (M, 2), none of them equal to the one before."""
+    if len(cells) < 2:
+        raise ValueError("a robot has only one cell for its goals: lifelong play needs two or more")
+    kept, last = [], goal
+    while len(kept) < length:
+        for cell in cells[rng.integers(len(cells), size=length)]:
+            if (cell != last).any():
+                kept.append(cell)
+                last = cell
+    return np.stack(kept[:length])

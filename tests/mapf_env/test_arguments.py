@@ -174,6 +174,11 @@ CALLS: dict[str, Any] = {
             "observe": FLAG,
         },
     ),
+    "BatchedEnv.assign_goals": (
+        begun(batch, "assign_goals"),
+        {"goals": [[[0, 0], [0, 1]], [[0, 0], [0, 1]]]},
+        {"goals": ARRAY},
+    ),
     "BatchedEnv.observe": (begun(batch, "observe"), {}, {"out": (*but(SEVERAL, NoneType), (None, None))}),
     "BatchedEnv.edges": (begun(batch, "edges"), {"graph": np.ones((2, 2, 2), np.float32)}, {"graph": ARRAY}),
     "parallel_env": (

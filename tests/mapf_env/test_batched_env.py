@@ -450,3 +450,62 @@ except (RuntimeError, MemoryError) as refusal:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("refused")
+
+
+@given(strategies.seeds, st.sampled_from(["one_shot", "lifelong"]))
+@hypothesis_settings(max_examples=30)
+def test_assigned_goals_are_seen_as_if_the_episode_had_begun_with_them(seed: int, task: str) -> None:
+    settings: dict[str, Any] = {
+        "num_agents": 3,
+        "height": 6,
+        "width": 5,
+        "extra_channels": ("cost_to_go", "other_goals"),
+    }
+    env = BatchedEnv(2, task=task, **settings)
+    generator = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    env.step(random_actions(env, generator))
+    other = BatchedEnv(2, task=task, **settings)
+    fresh = [random_instance(grid=grid, num_agents=3, seed=int(generator.integers(2**32))).goals for grid in env.grids]
+    env.assign_goals(fresh)
+    cases = [Instance(*parts) for parts in zip(env.grids, env.positions, fresh, strict=True)]
+    expected = other.reset(seed=0, instances=cases)
+    assert_equal(env.observe(), expected)
+    assert np.array_equal(env.goals, fresh)
+    assert np.array_equal(env.on_goal(), other.on_goal())
+
+
+def test_two_robots_may_be_sent_to_one_cell_and_the_first_to_come_counts() -> None:
+    env = corridor(task="lifelong")
+    env.assign_goals([[[0, 2], [0, 2]]])
+    assert env.step([[RIGHT, IDLE]]).arrived.tolist() == [[False, False]]
+    assert env.step([[RIGHT, IDLE]]).arrived.tolist() == [[True, False]]
+    goals = env.goals
+    goals[0, 0] = (0, 0)
+    env.assign_goals(goals)
+    assert env.goals.tolist() == [[[0, 0], [0, 2]]]
+
+
+def test_goals_that_cannot_be_assigned_are_refused_and_change_nothing() -> None:
+    walled = Instance(np.array([[0, 0, 1, 0]], bool), [[0, 0]], [[0, 1]])
+    env = BatchedEnv(1, num_agents=1, height=1, width=4)
+    with pytest.raises(RuntimeError, match=r"before the first reset: call reset\(\)"):
+        env.assign_goals([[[0, 0]]])
+    env.reset(seed=0, instances=[walled])
+    for goals, error, message in (
+        ([[[0, 2]]], ValueError, r"the goal \(0, 2\) of agent 0 in environment 0 is not a free cell"),
+        ([[[0, -1]]], ValueError, r"the goal \(0, -1\) of agent 0 in environment 0 is not a free cell"),
+        ([[[0, 3]]], ValueError, r"agent 0 in environment 0 cannot reach the goal \(0, 3\) from where it is"),
+        ([[[0, 0], [0, 1]]], ValueError, r"goals must have shape \(1, 1, 2\), got \(1, 2, 2\)"),
+        ([[[0.5, 0]]], TypeError, "goals must be integers"),
+    ):
+        with pytest.raises(error, match=message):
+            env.assign_goals(goals)
+    assert env.goals.tolist() == [[[0, 1]]]
+
+
+def test_goals_of_absent_robots_are_ignored() -> None:
+    env = BatchedEnv(1, num_agents=3, height=2, width=4, fill=True)
+    env.reset(seed=0, instances=[CORRIDOR])
+    env.assign_goals([[[0, 2], [0, 3], [9, 9]]])
+    assert env.goals.tolist() == [[[0, 2], [0, 3], [0, 0]]]

@@ -91,6 +91,35 @@ def test_robots_are_placed_as_pogema_places_them(
     assert found.instance(len(starts), seed) == Instance(found.grid, starts, goals)
 
 
+@pytest.mark.parametrize(
+    ("drawing", "seed", "goals"),
+    [
+        (
+            HALL,
+            0,
+            [[(1, 4), (3, 2), (4, 4), (0, 5), (1, 3)], [(2, 2), (4, 0), (4, 4), (1, 2), (1, 5)], [(2, 5), (2, 1)]],
+        ),
+        (
+            SPLIT,
+            4,
+            [[(3, 3), (1, 3), (2, 5), (3, 4), (3, 2)], [(0, 0), (0, 1), (1, 1), (1, 0), (0, 0)], [(4, 2), (1, 4)]],
+        ),
+        (MARKED, 1, [[(0, 3), (1, 1), (0, 3), (2, 3)], [(2, 3), (1, 3), (2, 3), (1, 1)]]),
+    ],
+)
+def test_goals_of_lifelong_play_are_drawn_as_pogema_draws_them(
+    drawing: str, seed: int, goals: list[list[tuple[int, int]]]
+) -> None:
+    """The expected cells are those that POGEMA 1.4.0 gives, except that it may repeat a goal on marked maps."""
+    found = parse_pogema_map(drawing).goal_sequences(len(goals), seed, 30)
+    assert found.shape == (len(goals), 30, 2)
+    for sequence, expected in zip(found, goals, strict=True):
+        assert oracles.cells(sequence[: len(expected)]) == expected
+        assert (sequence[1:] != sequence[:-1]).any(axis=1).all()
+    shorter = parse_pogema_map(drawing).goal_sequences(len(goals), seed, 4)
+    assert (shorter == found[:, :4]).all()
+
+
 @given(strategies.grids(), st.integers(0, 2**32), st.integers(1, 6))
 def test_placed_robots_are_an_instance_or_too_many(grid: oracles.Grid, seed: int, robots: int) -> None:
     drawn = "\n".join("".join("#" if cell else "." for cell in row) for row in grid)
