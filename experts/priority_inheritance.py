@@ -7,7 +7,9 @@ from experts.result import Result, as_result
 from mapf_env.instance import Instance
 
 
-def pibt(instance: Instance, *, max_steps: int = arguments.DEFAULT_MAX_STEPS, seed: int = 0) -> Result:
+def pibt(
+    instance: Instance, *, swap: bool = False, max_steps: int = arguments.DEFAULT_MAX_STEPS, seed: int = 0
+) -> Result:
     """Moves all robots step by step by priority inheritance with backtracking until all are on their goals at once.
 
     Okumura, Machida, Defago and Tamura 2022, "Priority inheritance with backtracking for iterative multi-agent path
@@ -15,8 +17,13 @@ def pibt(instance: Instance, *, max_steps: int = arguments.DEFAULT_MAX_STEPS, se
     has less priority; robots that have been under way for longest come first. Plans have no conflicts. On graphs whose
     cells all lie on cycles every robot reaches its goal some time, but not all of them need to rest there at once.
 
+    Plain PIBT never resolves two robots that face each other in a corridor. With `swap` (Okumura 2023, "Improving LaCAM
+    for scalable eventually optimal multi-agent pathfinding") one of them backs out to where the corridor branches and
+    pulls the other along, so that they change places.
+
     Args:
         instance: The problem.
+        swap: Let robots change places in corridors.
         max_steps: Joint steps after which to give up with the status `step_limit`.
         seed: Draws the first order of priorities and the order of equally good cells.
 
@@ -33,6 +40,7 @@ def pibt(instance: Instance, *, max_steps: int = arguments.DEFAULT_MAX_STEPS, se
         instance.grid,
         instance.starts,
         instance.goals,
+        arguments.flag(swap, "swap"),
         arguments.at_least_one(max_steps, "max_steps", maximum=arguments.MAX_STEPS),
         arguments.seed(seed),
     )

@@ -15,7 +15,7 @@ from mapf_env.instance import as_obstacles
 from mapf_env.rewards import SCHEMES, Rewards
 from mapf_env.senses import Senses, require_bytes
 
-Shield = Literal["idle", "pibt"]
+Shield = Literal["idle", "pibt", "pibt_swap"]
 Task = Literal["one_shot", "lifelong"]
 Dtype = Literal["float32", "uint8"]
 
@@ -43,7 +43,8 @@ class EnvConfig(Senses):
     message_loss: float = 0.0
     """Probability that an edge of the communication graph fails in a step."""
     shield: Shield = "idle"
-    """Collision shielding: "idle" is the paper's, "pibt" pushes robots aside by priority."""
+    """Collision shielding: "idle" is the paper's, "pibt" pushes robots aside by priority, and "pibt_swap" also lets two
+    robots change places in a corridor, which takes the map."""
     task: Task = "one_shot"
     """"lifelong": a robot on its goal gets a new one at the end of the step, and only max_cycles ends the episode."""
     reward: str | Rewards = "flowtime"
@@ -83,7 +84,7 @@ class EnvConfig(Senses):
     @property
     def needs_distances(self) -> bool:
         """True if the environment keeps every robot's distances to its goal."""
-        return self.needs_map or self.rewards.closer != 0.0
+        return self.shield == "pibt_swap" or self.needs_map or self.rewards.closer != 0.0
 
 
 def configured(settings: dict[str, Any], options: Iterable[str], grid: npt.ArrayLike | None) -> EnvConfig:

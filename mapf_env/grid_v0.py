@@ -67,8 +67,8 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         options = ("observation", "preferences", "reuse_buffers", "render_mode", "cases", "grid")
         self.config = config = configured(settings, options, grid)  # which refuses the options of a batch alone
         self._batch = BatchedEnv(1, cases=cases, grid=grid, **settings)
-        if preferences and config.shield != "pibt":
-            raise ValueError('preferences over all five moves need shield="pibt"')
+        if preferences and config.shield == "idle":
+            raise ValueError('preferences over all five moves need shield="pibt" or "pibt_swap"')
         self._observation, self._preferences, self._reuse = observation, preferences, reuse_buffers
         self.render_mode = render_mode
         self._screen = Screen(render_mode, self.metadata["render_fps"])

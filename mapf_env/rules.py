@@ -185,6 +185,9 @@ def pibt_shield(
     under_way: npt.NDArray[np.int32],
     seeds: npt.NDArray[np.uint64],
     times: npt.NDArray[np.int64],
+    *,
+    goals: npt.ArrayLike | None = None,
+    distances: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.int8]:
     """The actions (B, N) of one step of priority inheritance with backtracking; they never collide.
 
@@ -193,13 +196,25 @@ def pibt_shield(
     by the environment's seed and time. Robots choose in the order of `under_way` (B, N), the longest under way first,
     equal ones in an order drawn by the seed; a robot in the way of a more important one moves aside if it can.
     Source: Okumura, Machida, Defago and Tamura 2022.
+
+    With `goals` (B, N, 2) and their `distances` of `distance_tables`, two robots that face each other in a corridor
+    change places: one backs out to where the corridor branches and pulls the other along. Source: Okumura 2023,
+    "Improving LaCAM for scalable eventually optimal multi-agent pathfinding".
+
+    Raises:
+        ValueError: If shapes do not fit together, or only one of `goals` and `distances` is given.
     """
+    if (goals is None) != (distances is None):
+        raise ValueError("swaps need both goals and distances (see rules.distance_tables): give both or neither")
     array = arguments.numbers(wanted, "wanted")
     if array.ndim == 3:
         values, actions = as_values(array), np.zeros((0, 0), np.int64)
     else:
         values, actions = np.zeros((0, 0, 0), np.float32), as_actions(array)
-    return _native.pibt_shield(obstacles, fov_radius, _cells(positions), values, actions, under_way, seeds, times)
+    there = None if goals is None else _cells(goals, "goals")
+    return _native.pibt_shield(
+        obstacles, fov_radius, _cells(positions), values, actions, under_way, seeds, times, there, distances
+    )
 
 
 def draw_goals(

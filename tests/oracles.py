@@ -115,15 +115,28 @@ def harmless(grid: Grid, before: Sequence[Cell], actions: Sequence[int]) -> list
             chosen[robot] = IDLE
 
 
-def pibt(grid: Grid, team: Sequence[Cell], order: Sequence[int], wishes: Sequence[Sequence[int]]) -> list[int]:
+def pibt(
+    grid: Grid,
+    team: Sequence[Cell],
+    order: Sequence[int],
+    wishes: Sequence[Sequence[int]],
+    goals: Sequence[Cell] | None = None,
+) -> list[int]:
     """The joint action of PIBT as the paper has it (Okumura et al. 2022, algorithm 1).
 
-    `order` names the robots, the most important first; `wishes[i]` are the five actions, the most wanted first.
+    `order` names the robots, the most important first; `wishes[i]` are the five actions, the most wanted first. With
+    `goals` robots swap (Okumura 2023, "Improving LaCAM ...", section on the swap technique).
     """
     free, chosen = free_cells(grid), dict[int, int]()
 
     def planned(robot: int, pusher: int | None) -> bool:
-        for action in wishes[robot]:
+        wanted = [action for action in wishes[robot] if moved(team[robot], action) in free]
+        partner = None
+        if goals is not None:
+            partner = swap_partner(grid, team, goals, robot, moved(team[robot], wanted[0]), chosen)
+        if partner is not None:
+            wanted.reverse()
+        for rank, action in enumerate(wanted):
             there = moved(team[robot], action)
             taken = any(moved(team[other], chosen[other]) == there for other in chosen)
             if there not in free or taken or (pusher is not None and there == team[pusher]):
@@ -131,6 +144,10 @@ def pibt(grid: Grid, team: Sequence[Cell], order: Sequence[int], wishes: Sequenc
             chosen[robot] = action
             in_the_way = [other for other, cell in enumerate(team) if cell == there and other not in chosen]
             if not in_the_way or planned(in_the_way[0], robot):
+                left = team[robot]
+                left_free = all(moved(team[other], chosen[other]) != left for other in chosen)
+                if rank == 0 and partner is not None and partner not in chosen and left_free:
+                    chosen[partner] = next(a for a in STEP if moved(team[partner], a) == left)
                 return True
             del chosen[robot]
         chosen[robot] = IDLE
@@ -140,6 +157,57 @@ def pibt(grid: Grid, team: Sequence[Cell], order: Sequence[int], wishes: Sequenc
         if robot not in chosen:
             planned(robot, None)
     return [chosen[robot] for robot in range(len(team))]
+
+
+def swap_partner(
+    grid: Grid, team: Sequence[Cell], goals: Sequence[Cell], robot: int, target: Cell, chosen: dict[int, int]
+) -> int | None:
+    """The robot that has to change places with `robot`, which wants to enter `target`, if there is one and it can."""
+    free, here = free_cells(grid), team[robot]
+    to_goal = [distances(grid, goal) for goal in goals]
+
+    def around(cell: Cell) -> list[Cell]:
+        return [there for action in range(4) if (there := moved(cell, action)) in free]
+
+    def far(who: int, cell: Cell) -> float:
+        return to_goal[who].get(cell, float("inf"))
+
+    def onward(back: Cell, front: Cell) -> list[Cell]:
+        """Where a robot that came to `front` from `back` can go on to."""
+        blocked = {cell for cell in around(front) if len(around(cell)) == 1 and cell in team}
+        blocked = {cell for cell in blocked if goals[team.index(cell)] == cell}
+        return [cell for cell in around(front) if cell != back and cell not in blocked]
+
+    def required(pusher: int, puller: int, back: Cell, front: Cell) -> bool:
+        while far(pusher, front) < far(pusher, back):
+            ways = onward(back, front)
+            if len(ways) > 1:
+                return False
+            if not ways:
+                break
+            back, front = front, ways[0]
+        stays = far(pusher, back) == 0 or far(pusher, front) < far(pusher, back)
+        return far(puller, back) < far(puller, front) and stays
+
+    def possible() -> bool:
+        back, front = target, here
+        while front != target:
+            ways = onward(back, front)
+            if len(ways) != 1:
+                return len(ways) > 1
+            back, front = front, ways[0]
+        return False
+
+    if target == here:
+        return None
+    if target in team and team.index(target) not in chosen:
+        ahead = team.index(target)
+        if required(robot, ahead, here, target) and possible():
+            return ahead
+    for side in around(here):
+        if side != target and side in team and required(team.index(side), robot, here, target) and possible():
+            return team.index(side)
+    return None
 
 
 def field_of_view(grid: Grid, positions: Sequence[Cell], goals: Sequence[Cell], robot: int, radius: int) -> Grid:

@@ -85,7 +85,7 @@ def all_settings(draw: st.DrawFn) -> dict[str, Any]:
         "comm_range": draw(st.sampled_from(["fixed", "connected"])),
         "comm_weights": draw(st.sampled_from(["binary", "distance"])),
         "message_loss": draw(st.sampled_from([0.0, 0.3, 1.0])),
-        "shield": draw(st.sampled_from(["idle", "pibt"])),
+        "shield": draw(st.sampled_from(["idle", "pibt", "pibt_swap"])),
         "task": draw(st.sampled_from(["one_shot", "lifelong"])),
         "reward": draw(st.one_of(st.sampled_from(sorted(SCHEMES)), st.builds(Rewards, *[parts] * 6))),
     }

@@ -25,11 +25,12 @@ void prefer_short_ways(const Grid& grid, const Distance* distance, int cell, Ran
 
 }  // namespace
 
-PibtRun run_pibt(const Problem& problem, int max_steps, std::uint64_t seed, Budget& budget) {
+PibtRun run_pibt(const Problem& problem, bool swap, int max_steps, std::uint64_t seed, Budget& budget) {
     const std::size_t num_robots = problem.starts.size();
     const auto steps = problem.grid.layout.steps();
     Random random(seed);
     PibtStep<> step(problem.grid.layout);
+    const TableSwaps swaps{problem.goals, [&](int robot) { return problem.distances.to_goal_of(robot); }};
     PibtRun run{false, {}, std::vector<int>(num_robots, 0)};
     std::vector<int> cells(problem.starts.begin(), problem.starts.end()), order(num_robots), under_way(num_robots, 0);
     std::vector<std::uint8_t> preferences(num_robots * num_actions), actions(num_robots);
@@ -47,7 +48,10 @@ PibtRun run_pibt(const Problem& problem, int max_steps, std::uint64_t seed, Budg
         for (std::size_t robot = 0; robot < num_robots; ++robot)
             prefer_short_ways(problem.grid, problem.distances.to_goal_of(robot), cells[robot], random,
                               &preferences[robot * num_actions]);
-        step.decide(problem.grid.blocked.data(), cells, order, preferences, actions);
+        if (swap)
+            step.decide(problem.grid.blocked.data(), cells, order, preferences, actions, swaps);
+        else
+            step.decide(problem.grid.blocked.data(), cells, order, preferences, actions);
         for (std::size_t robot = 0; robot < num_robots; ++robot) {
             cells[robot] += steps[actions[robot]];
             under_way[robot] = cells[robot] == problem.goals[robot] ? 0 : under_way[robot] + 1;

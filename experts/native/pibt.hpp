@@ -18,7 +18,7 @@ struct PibtRun {
 };
 
 // Each robot prefers the moves that bring it closer to its goal, ties in a random order drawn from `seed`. Robots that
-// have been under way for longest come first.
-PibtRun run_pibt(const Problem& problem, int max_steps, std::uint64_t seed, Budget& budget);
+// have been under way for longest come first. With `swap`, robots that face each other in a corridor change places.
+PibtRun run_pibt(const Problem& problem, bool swap, int max_steps, std::uint64_t seed, Budget& budget);
 
 }  // namespace mapf

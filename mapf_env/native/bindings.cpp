@@ -1,6 +1,7 @@
 // Python's view of the world's kernels: shapes are checked here, the kernels trust them.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
 #include <algorithm>
@@ -270,10 +271,18 @@ Out<mapf::Distance> distance_tables(In<T, 3> obstacles, int pad, In<std::int32_t
 template <class T>
 Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, In<float, 3> values,
                              In<std::int64_t, 2> actions, In<std::int32_t, 2> under_way, In<std::uint64_t, 1> seeds,
-                             In<std::int64_t, 1> times) {
+                             In<std::int64_t, 1> times, std::optional<In<std::int32_t, 3>> goals,
+                             std::optional<In<mapf::Distance, 3>> distances) {
     const auto layout = layout_of(obstacles, pad);
-    const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1);
+    const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1), size = layout.size();
     require_on_map(positions, layout, num_envs, "positions");
+    const bool swap = goals.has_value() && distances.has_value();
+    if (swap) {
+        require_on_map(*goals, layout, num_envs, "goals");
+        require(goals->shape(1) == num_agents && distances->shape(0) == num_envs &&
+                    distances->shape(1) == num_agents && distances->shape(2) == size,
+                "goals must have shape (B, N, 2) and distances be the distance tables of these goals");
+    }
     const bool by_values = values.size() > 0;
     const std::size_t robots = by_values ? values.shape(1) : actions.shape(1);
     require((by_values ? values.shape(0) : actions.shape(0)) == num_envs && robots == num_agents,
@@ -287,6 +296,7 @@ Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> po
     auto [executed, out] = make_array<std::int8_t>({num_envs, num_agents});
     nb::gil_scoped_release release;
     mapf::PibtScratch<T> scratch(layout, static_cast<int>(num_agents));
+    std::vector<int> goal_cells;
     for (std::size_t b = 0; b < num_envs; ++b) {
         const std::size_t first = b * num_agents;
         const std::uint64_t key = mapf::mix(mapf::seed_for(mapf::Use::preferences, seeds(b)), times(b));
@@ -297,9 +307,20 @@ Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> po
             else
                 mapf::prefer_action(static_cast<int>(actions.data()[first + i]), mapf::mix(key, i),
                                     &scratch.preferences[i * mapf::num_actions]);
-        mapf::pibt_shield(layout, obstacles.data() + b * layout.size(), positions.data() + first * 2,
-                          under_way.data() + first, static_cast<int>(num_agents),
-                          mapf::seed_for(mapf::Use::priorities, seeds(b)), scratch, executed + first);
+        const auto shield = [&](const auto& swaps) {
+            mapf::pibt_shield(layout, obstacles.data() + b * size, positions.data() + first * 2,
+                              under_way.data() + first, static_cast<int>(num_agents),
+                              mapf::seed_for(mapf::Use::priorities, seeds(b)), scratch, executed + first, swaps);
+        };
+        if (!swap) {
+            shield(mapf::NoSwaps{});
+            continue;
+        }
+        goal_cells.clear();
+        for (std::size_t i = first; i < first + num_agents; ++i)
+            goal_cells.push_back(layout.cell(goals->data()[2 * i], goals->data()[2 * i + 1]));
+        shield(mapf::TableSwaps{std::span<const int>(goal_cells),
+                                [&](int robot) { return distances->data() + (first + robot) * size; }});
     }
     return out;
 }
@@ -342,7 +363,7 @@ void define_for_dtype(nb::module_& m) {
     m.def("distance_tables", &distance_tables<T>, "obstacles"_a, "pad"_a, "goals"_a,
           "(B, N, size) uint16 steps from each cell of the bordered map to each goal; 65535 where there is no way.");
     m.def("pibt_shield", &pibt_shield<T>, "obstacles"_a, "pad"_a, "positions"_a, "values"_a, "actions"_a,
-          "under_way"_a, "seeds"_a, "times"_a,
+          "under_way"_a, "seeds"_a, "times"_a, "goals"_a = nb::none(), "distances"_a = nb::none(),
           "(B, N) int8 actions by priority inheritance, from values (B, N, 5) or, if these are empty, actions (B, N).");
     m.def("draw_goals", &draw_goals<T>, "obstacles"_a, "pad"_a, "positions"_a, "goals"_a.noconvert(), "arrivals"_a,
           "arrived"_a, "seeds"_a, "Replace the goals (B, N, 2) of the robots that have arrived (B, N) by new ones.");

@@ -57,11 +57,12 @@ struct PibtScratch {
           actions(num_agents) {}
 };
 
-// Executes the orders of preference in `scratch`. Robots that have been under way (N) for longest come first, equal ones
+// Executes the orders of preference in `scratch`, with swaps as PibtStep::decide takes them. Robots that have been under way (N) for longest come first, equal ones
 // in the order that `key` draws. `blocked` is the map in its layout, pad >= 1.
-template <class T>
+template <class T, class Swaps = NoSwaps>
 void pibt_shield(const Layout& layout, const T* blocked, const std::int32_t* positions, const std::int32_t* under_way,
-                 int num_agents, std::uint64_t key, PibtScratch<T>& scratch, std::int8_t* executed) {
+                 int num_agents, std::uint64_t key, PibtScratch<T>& scratch, std::int8_t* executed,
+                 const Swaps& swaps = {}) {
     const std::size_t n = num_agents;
     for (int i = 0; i < num_agents; ++i) {
         scratch.cells[i] = layout.cell(positions[2 * i], positions[2 * i + 1]);
@@ -71,7 +72,7 @@ void pibt_shield(const Layout& layout, const T* blocked, const std::int32_t* pos
     for (int i = 0; i < num_agents; ++i) scratch.order[i] = scratch.rank[i].second;
     const std::span<std::uint8_t> actions(scratch.actions.data(), n);
     scratch.step.decide(blocked, {scratch.cells.data(), n}, {scratch.order.data(), n},
-                        {scratch.preferences.data(), n * num_actions}, actions);
+                        {scratch.preferences.data(), n * num_actions}, actions, swaps);
     for (std::size_t i = 0; i < n; ++i) executed[i] = static_cast<std::int8_t>(actions[i]);
 }
 

@@ -1,5 +1,11 @@
 // One step of priority inheritance with backtracking (Okumura, Machida, Defago and Tamura 2022, "Priority inheritance
 // with backtracking for iterative multi-agent path finding"): joint moves without a conflict, whatever is preferred.
+//
+// A robot reserves its most preferred free cell; a robot that stands there inherits the priority and moves first.
+// Invariant: the cells in next_ are distinct and no two robots exchange cells, also while a push is backtracked.
+//
+// With swaps (Okumura 2023, "Improving LaCAM for scalable eventually optimal multi-agent pathfinding") two robots that
+// face each other in a corridor change places: one backs out to where the corridor branches and pulls the other along.
 #pragma once
 
 #include <algorithm>
@@ -13,6 +19,21 @@
 
 namespace mapf {
 
+// Swaps are off: PIBT as it was first published.
+struct NoSwaps {
+    static constexpr bool on = false;
+};
+
+// Swaps by tables of distances: distance_of(robot) is the table of its distances to goals[robot].
+template <class DistanceOf>
+struct TableSwaps {
+    static constexpr bool on = true;
+    std::span<const int> goals;
+    DistanceOf distance_of;
+
+    bool nearer(int robot, int from, int to) const { return distance_of(robot)[to] < distance_of(robot)[from]; }
+};
+
 // The memory of the steps on maps of one layout, pad >= 1, whose obstacles are the cells that are not T{0}.
 template <class T = std::uint8_t>
 class PibtStep {
@@ -22,18 +43,21 @@ public:
 
     // Decides each robot's action. `cells` (N) are distinct; `order` (N) names the robots, the most important first;
     // `preferences` (N * 5) holds each robot's five actions, the most wanted first.
+    template <class Swaps = NoSwaps>
     void decide(const T* blocked, std::span<const int> cells, std::span<const int> order,
-                std::span<const std::uint8_t> preferences, std::span<std::uint8_t> actions) {
+                std::span<const std::uint8_t> preferences, std::span<std::uint8_t> actions, const Swaps& swaps = {}) {
         std::fill(actions.begin(), actions.end(), undecided);
-        complete(blocked, cells, order, preferences, actions);
+        complete(blocked, cells, order, preferences, actions, swaps);
     }
 
     static constexpr std::uint8_t undecided = num_actions;
 
-    // The same for the robots whose action is `undecided`; what the others do is fixed. Returns whether all goes
-    // together, which may not be where moves are fixed.
+    // Decides for the robots whose action is `undecided`; the actions of the others are fixed. Returns true if all
+    // actions are compatible; fixed moves can make that impossible. `swaps` (NoSwaps, or with `goals` and nearer(robot,
+    // from, to): true if `to` is nearer to the robot's goal than its neighbour `from`) decides who changes places.
+    template <class Swaps = NoSwaps>
     bool complete(const T* blocked, std::span<const int> cells, std::span<const int> order,
-                  std::span<const std::uint8_t> preferences, std::span<std::uint8_t> actions) {
+                  std::span<const std::uint8_t> preferences, std::span<std::uint8_t> actions, const Swaps& swaps = {}) {
         blocked_ = blocked;
         cells_ = cells;
         preferences_ = preferences;
@@ -43,7 +67,7 @@ public:
         for (std::size_t robot = 0; robot < cells.size(); ++robot)
             if (actions[robot] != undecided) possible = possible && fix(static_cast<int>(robot));
         for (const int robot : order)
-            if (possible && actions[robot] == undecided) possible = plan(robot) || next_[cells[robot]] == robot;
+            if (possible && actions[robot] == undecided) possible = plan(robot, nobody, swaps) || next_[cells[robot]] == robot;
         for (std::size_t robot = 0; robot < cells.size(); ++robot) {
             now_[cells[robot]] = nobody;
             for (const int step : steps_) next_[cells[robot] + step] = nobody;
@@ -63,25 +87,128 @@ private:
         return other == nobody || other == robot || next_[cell] != other;
     }
 
-    // Whether the robot finds a move for itself and those it pushes; else it stays, which its pusher has to accept.
-    bool plan(int robot, int pusher = nobody) {
+    // Finds a move for the robot and those it pushes. If there is none it returns false, and the robot stays.
+    template <class Swaps>
+    bool plan(int robot, int pusher, const Swaps& swaps) {
         const int cell = cells_[robot];
-        for (int rank = 0; rank < num_actions; ++rank) {
-            const std::uint8_t action = preferences_[robot * num_actions + rank];
+        auto candidates = candidates_of(robot);
+        // Swap: the robot that has to give way takes its candidates in reverse order, which leads it out backwards.
+        int partner = nobody;
+        if constexpr (Swaps::on) {
+            partner = swap_partner(robot, cell + steps_[candidates.action[0]], swaps);
+            if (partner != nobody) std::reverse(candidates.action.begin(), candidates.action.begin() + candidates.count);
+        }
+        for (int rank = 0; rank < candidates.count; ++rank) {
+            const std::uint8_t action = candidates.action[rank];
             const int target = cell + steps_[action];
-            if (blocked_[target] != T{0} || next_[target] != nobody) continue;
+            if (next_[target] != nobody) continue;
             const int other = now_[target];
             const bool occupied = other != nobody && other != robot;
             if (occupied && actions_[other] != undecided && cells_[other] + steps_[actions_[other]] == cell) continue;
             actions_[robot] = action;
             next_[target] = robot;
-            if (!occupied || actions_[other] != undecided || plan(other, robot)) return true;
+            // Priority inheritance: a robot that stands in the target has to find a move of its own.
+            if (occupied && actions_[other] == undecided && !plan(other, robot, swaps)) continue;
+            if (Swaps::on && rank == 0 && partner != nobody) pull(partner, cell);
+            return true;
         }
-        // Whoever wants the cell has to step back, unless the move was fixed.
+        // Backtracking: a robot that wants this cell has to step back, unless its move was fixed.
         const int claimant = next_[cell];
         if (claimant == nobody || claimant == pusher) {
             actions_[robot] = idle;
             next_[cell] = robot;
+        }
+        return false;
+    }
+
+    struct Candidates {
+        std::array<std::uint8_t, num_actions> action;
+        int count;
+    };
+
+    // The actions that stay on the map, in the order of preference.
+    Candidates candidates_of(int robot) const {
+        Candidates candidates{{}, 0};
+        for (int rank = 0; rank < num_actions; ++rank) {
+            const std::uint8_t action = preferences_[robot * num_actions + rank];
+            if (blocked_[cells_[robot] + steps_[action]] == T{0}) candidates.action[candidates.count++] = action;
+        }
+        return candidates;
+    }
+
+    // Pull: the partner takes the cell that the robot leaves, if neither of them is promised to anyone else.
+    void pull(int partner, int cell) {
+        if (actions_[partner] != undecided || next_[cell] != nobody) return;
+        next_[cell] = partner;
+        actions_[partner] = static_cast<std::uint8_t>(std::find(steps_.begin(), steps_.end(), cell - cells_[partner]) -
+                                                      steps_.begin());
+    }
+
+    // The robot with which `robot`, which wants to enter `target`, has to change places and can; or nobody.
+    template <class Swaps>
+    int swap_partner(int robot, int target, const Swaps& swaps) const {
+        const int cell = cells_[robot];
+        if (target == cell) return nobody;
+        // The robot ahead comes the other way.
+        const int ahead = now_[target];
+        if (ahead != nobody && actions_[ahead] == undecided && swap_required(robot, ahead, cell, target, swaps) &&
+            swap_possible(target, cell, swaps))
+            return ahead;
+        // Clear operation: a robot beside it would have to swap if this one went ahead, so this one waits outside.
+        for (int action = 0; action < idle; ++action) {
+            const int side = cell + steps_[action], other = now_[side];
+            if (other == nobody || side == target) continue;
+            if (swap_required(other, robot, cell, target, swaps) && swap_possible(target, cell, swaps)) return other;
+        }
+        return nobody;
+    }
+
+    // A cell's ways on, except back to `from` and into dead ends whose robot rests on its goal.
+    struct Ways {
+        int count = 0, last = nobody;
+    };
+
+    template <class Swaps>
+    Ways ways_on(int from, int cell, const Swaps& swaps) const {
+        Ways ways;
+        for (int action = 0; action < idle; ++action) {
+            const int next = cell + steps_[action];
+            if (next == from || blocked_[next] != T{0}) continue;
+            if (const int robot = now_[next]; robot != nobody && swaps.goals[robot] == next && is_dead_end(next)) continue;
+            ways = {ways.count + 1, next};
+        }
+        return ways;
+    }
+
+    bool is_dead_end(int cell) const {
+        int degree = 0;
+        for (int action = 0; action < idle; ++action) degree += blocked_[cell + steps_[action]] == T{0};
+        return degree == 1;
+    }
+
+    // True if the pusher in cell `back` cannot pass the puller in cell `front` ahead of it: it pushes it on until the
+    // corridor ends, and there each of them still wants to go where the other one is.
+    template <class Swaps>
+    bool swap_required(int pusher, int puller, int back, int front, const Swaps& swaps) const {
+        while (swaps.nearer(pusher, back, front)) {
+            const auto ways = ways_on(back, front, swaps);
+            if (ways.count > 1) return false;
+            if (ways.count == 0) break;
+            back = front;
+            front = ways.last;
+        }
+        return swaps.nearer(puller, front, back) &&
+               (swaps.goals[pusher] == back || swaps.nearer(pusher, back, front));
+    }
+
+    // True if a robot that backs out of `cell`, away from `ahead`, comes to a branch where it can let another one pass.
+    template <class Swaps>
+    bool swap_possible(int ahead, int cell, const Swaps& swaps) const {
+        for (const int origin = ahead; cell != origin;) {
+            const auto ways = ways_on(ahead, cell, swaps);
+            if (ways.count != 1) return ways.count > 1;
+            ahead = cell;
+            cell = ways.last;
         }
         return false;
     }

@@ -75,7 +75,8 @@ Options options_of(nb::handle config) {
     const nb::object rewards = config.attr("rewards");
     Options options;
     options.senses = senses_of(config);
-    options.pibt = says("shield", "pibt");
+    options.pibt = !says("shield", "idle");
+    options.swap = says("shield", "pibt_swap");
     options.lifelong = says("task", "lifelong");
     options.message_loss = nb::cast<double>(config.attr("message_loss"));
     options.comm_radius = nb::cast<double>(config.attr("comm_radius"));
@@ -128,7 +129,7 @@ public:
         teams_.arrived = own<bool>("arrived", {B, N});
         teams_.on_goal = own<bool>("on_goal", {B, N});
         teams_.action_mask = own<std::int8_t>("action_mask", {B, N, num_actions});
-        const bool distances = options_.senses.needs_map || options_.rewards.closer != 0.0f;
+        const bool distances = options_.swap || options_.senses.needs_map || options_.rewards.closer != 0.0f;
         teams_.distances = own<Distance>("distances", {B, N, size}, !distances);
         for (int part = 0; part < threads; ++part) scratch_.emplace_back(teams_.layout, static_cast<int>(N));
     }
@@ -145,7 +146,8 @@ public:
     void step_by_values(In<float, 3> values, nb::handle out, bool skip_ended) {
         const std::size_t B = teams_.num_envs, N = teams_.num_agents;
         if (!options_.pibt)
-            fail("actions must have shape " + shown({B, N}) + "; values of all five actions need shield=\"pibt\"");
+            fail("actions must have shape " + shown({B, N}) +
+                 "; values of all five actions need a shield other than \"idle\"");
         if (values.shape(0) != B || values.shape(1) != N || values.shape(2) != num_actions)
             fail("values of actions must have shape " + shown({B, N, num_actions}) + ", got " +
                  shown({values.shape(0), values.shape(1), values.shape(2)}));
@@ -384,7 +386,7 @@ void define(nb::module_& m, const char* name, const char* memory) {
         .def("step", &Stepper<T>::step, "actions"_a, "out"_a.none(), "skip_ended"_a,
              "Execute joint actions (B, N) under the shield and write what the robots perceive, unless out is None.")
         .def("step_by_values", &Stepper<T>::step_by_values, "values"_a, "out"_a.none(), "skip_ended"_a,
-             "Execute by values of all five actions (B, N, 5), under shield \"pibt\" only.")
+             "Execute by values of all five actions (B, N, 5), under a shield other than \"idle\".")
         .def("observe", &Stepper<T>::observe, "out"_a, "chosen"_a.none(),
              "Write what the robots perceive, of all teams or of the chosen ones (B,).")
         .def("bag", &Stepper<T>::bag, "chosen"_a.none(),

@@ -25,7 +25,7 @@ struct Rewards {
 
 struct Options {
     Senses senses;
-    bool pibt = false, lifelong = false;
+    bool pibt = false, swap = false, lifelong = false;
     double message_loss = 0.0;
     double comm_radius = 0.0;
     bool connected = false;  // comm_radius grows at the beginning until the team is connected
@@ -68,12 +68,13 @@ struct alignas(64) TeamScratch {
     std::vector<std::int8_t> executed;
     std::vector<int> standing;
     std::vector<float> rows, cols;
+    std::vector<int> goal_cells;
     std::vector<Distance> distance;
     std::vector<int> queue;
 
     TeamScratch(const Layout& layout, int num_agents)
         : shield(layout, num_agents), pibt(layout, num_agents), marks(layout.size(), T{0}), taken(layout.size(), 0),
-          executed(num_agents) {}
+          executed(num_agents), goal_cells(num_agents) {}
 };
 
 template <class T>
@@ -298,8 +299,18 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
                 prefer_values(wishes.values + (first + i) * num_actions, preferences + i * num_actions);
             else
                 prefer_action(static_cast<int>(wishes.actions[first + i]), mix(key, i), preferences + i * num_actions);
-        pibt_shield(layout, obstacles, positions, teams.under_way + first, n, seed_for(Use::priorities, seed),
-                    scratch.pibt, executed);
+        const std::uint64_t priorities = seed_for(Use::priorities, seed);
+        if (options.swap) {
+            auto& cells = scratch.goal_cells;
+            for (int i = 0; i < n; ++i) cells[i] = layout.cell(goals[2 * i], goals[2 * i + 1]);
+            const TableSwaps swaps{std::span<const int>(cells.data(), n), [&](int robot) {
+                                       return teams.distances + (first + robot) * layout.size();
+                                   }};
+            pibt_shield(layout, obstacles, positions, teams.under_way + first, n, priorities, scratch.pibt, executed,
+                        swaps);
+        } else {
+            pibt_shield(layout, obstacles, positions, teams.under_way + first, n, priorities, scratch.pibt, executed);
+        }
         for (int i = 0; i < n; ++i) replaced[i] = executed[i] != preferences[i * num_actions];
     } else {
         shield(layout, obstacles, positions, wishes.actions + first, n, mix(seed_for(Use::ties, seed), time),

@@ -1,3 +1,5 @@
+import hashlib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ import experts
 import plan_oracles
 import strategies
 from experts import Status
-from mapf_env import Instance, random_instance
+from mapf_env import Instance, Maze, random_instance
 
 
 @settings(deadline=None, max_examples=200)
@@ -52,10 +54,48 @@ def test_a_corridor_ends_at_the_step_limit() -> None:
     assert experts.pibt(corridor, max_steps=50).status is Status.STEP_LIMIT
 
 
+@settings(deadline=None, max_examples=200)
+@given(strategies.instances(max_side=5, max_agents=12), st.integers(0, 2**64 - 1))
+def test_plans_with_swaps_have_no_conflicts(instance: Instance, seed: int) -> None:
+    result = experts.pibt(instance, swap=True, max_steps=100, seed=seed)
+    if result.solution is not None:
+        assert plan_oracles.faults(instance.grid, instance.starts, instance.goals, result.solution.paths) == []
+
+
+def test_robots_change_places_in_a_corridor_with_one_branch() -> None:
+    grid = np.array([[0] * 9, [1, 0, *[1] * 7]], bool)
+    facing = Instance(grid, [(0, 3), (0, 8)], [(0, 8), (0, 3)])
+    for seed in range(10):
+        assert experts.pibt(facing, seed=seed).status is Status.STEP_LIMIT
+        assert experts.pibt(facing, swap=True, seed=seed).solved
+
+
+def test_swaps_bring_crowds_home_that_are_stuck_without() -> None:
+    crowds = [random_instance(height=21, width=21, num_agents=16, style=Maze(), seed=seed) for seed in range(20)]
+    plain, swap = (sum(experts.pibt(crowd, swap=swap).solved for crowd in crowds) for swap in (False, True))
+    assert plain <= 5
+    assert swap >= 18
+
+
+def test_without_swap_plans_are_those_of_earlier_versions() -> None:
+    """The digest is that of the version before swaps were added."""
+    digest = hashlib.sha256()
+    for seed in range(10):
+        for num_agents in (5, 20, 60):
+            instance = random_instance(num_agents=num_agents, density=0.2, seed=seed)
+            result = experts.pibt(instance, max_steps=100, seed=seed)
+            digest.update(repr((str(result.status), result.cost, result.expansions)).encode())
+            if result.solution is not None:
+                digest.update(result.solution.paths.astype("<i4").tobytes())
+    assert digest.hexdigest() == "26105728259db5c0d4c540062327d1aa19958327b1f22b47ac223e5bc6912df4"
+
+
 def test_bad_arguments_are_named() -> None:
     instance = random_instance(seed=0)
     with pytest.raises(ValueError, match="max_steps"):
         experts.pibt(instance, max_steps=0)
+    with pytest.raises(TypeError, match="swap"):
+        experts.pibt(instance, swap=1)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="seed"):
         experts.pibt(instance, seed=-1)
     with pytest.raises(TypeError, match="instance must be"):

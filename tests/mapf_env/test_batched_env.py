@@ -331,7 +331,7 @@ def test_global_random_state_is_neither_read_nor_written() -> None:
         ({"comm_radius": -1.0}, "comm_radius must not be negative, got -1.0"),
         ({"comm_radius": float("nan")}, "comm_radius must not be negative, got nan"),
         ({"style": "cave"}, "style must be one of cells, walls, maze, room, warehouse, empty, or a Maze, Rooms, W"),
-        ({"shield": "none"}, "shield must be one of idle, pibt, got 'none'"),
+        ({"shield": "none"}, "shield must be one of idle, pibt, pibt_swap, got 'none'"),
         ({"dtype": "float64"}, "dtype must be one of float32, uint8, got 'float64'"),
         ({"num_agents": 361}, "has 360 free cells, too few for 361 agents .*: ask for fewer agents or a lower"),
         ({"density": 0.99}, "has 4 free cells, too few for 10 agents"),

@@ -84,13 +84,16 @@ def test_the_fused_step_is_the_rules_one_after_another(
         maps = rules.bordered(env.grids, config.fov_radius, config.dtype)
         wanted = generator.integers(0, 5, (num_envs, N))
         values = generator.normal(size=(num_envs, N, 5)).astype(np.float32)
-        by_values = config.shield == "pibt" and time % 2 == 1
+        by_values = config.shield != "idle" and time % 2 == 1
         times = np.full(num_envs, time)
         if config.shield == "idle":
             executed = rules.shield(maps, config.fov_radius, before, wanted, seeds, times)
         else:
             asked = values if by_values else wanted
-            executed = rules.pibt_shield(maps, config.fov_radius, before, asked, under_way, seeds, times)
+            swap: dict[str, Any] = {}
+            if config.shield == "pibt_swap":
+                swap = {"goals": goals, "distances": rules.distance_tables(maps, config.fov_radius, goals)}
+            executed = rules.pibt_shield(maps, config.fov_radius, before, asked, under_way, seeds, times, **swap)
             wanted = values.argmax(-1) if by_values else wanted
         step = env.step(values if by_values else wanted)
         observation, moves = step.observation, [executed, *moves]
@@ -163,6 +166,90 @@ def test_pibt_is_the_algorithm_of_its_paper(
     assert pibt_alone(grid, team, values, under_way, seed=data.draw(strategies.seeds)) == expected
 
 
+@given(strategies.instances(max_side=6, max_agents=8), st.data())
+@hypothesis_settings(max_examples=500)
+def test_swaps_are_those_of_the_paper(instance: Instance, data: st.DataObject) -> None:
+    grid, team, goals = instance.grid, oracles.cells(instance.starts), oracles.cells(instance.goals)
+    under_way = data.draw(st.permutations(range(len(team))))
+    wishes = [data.draw(st.permutations(range(5))) for _ in team]
+    by_distance = data.draw(st.booleans())  # as a planner would have them
+    if by_distance:
+        tables = [oracles.distances(grid, goal) for goal in goals]
+        wishes = [
+            tuple(sorted(wish, key=lambda action: table.get(oracles.moved(cell, action), 10**6)))
+            for wish, table, cell in zip(wishes, tables, team, strict=True)
+        ]
+    values = np.array([[[-wish.index(action) for action in range(5)] for wish in wishes]], np.float32)
+    order = sorted(range(len(team)), key=lambda robot: -under_way[robot])
+    expected = oracles.pibt(grid, team, order, wishes, goals)
+    executed = pibt_alone(grid, team, values, under_way, seed=0, goals=goals)
+    assert executed == expected
+    after = [oracles.moved(cell, action) for cell, action in zip(team, executed, strict=True)]
+    assert oracles.faults(grid, team, after) == []
+
+
+@pytest.mark.parametrize("walls", [["....", "##.#"], [".#.", "...", ".#."], ["...", ".#.", "..."]])
+def test_no_swap_of_a_small_team_is_illegal(walls: list[str]) -> None:
+    """All teams of two robots with all goals on maps of a few cells, and of three on the smallest."""
+    grid = np.array([[cell == "#" for cell in row] for row in walls])
+    free = sorted(oracles.free_cells(grid))
+    maps = rules.bordered(grid[None], 2)
+    wishes = {
+        (cell, goal): sorted(range(5), key=lambda action: table.get(oracles.moved(cell, action), 99))
+        for goal in free
+        for table in [oracles.distances(grid, goal)]
+        for cell in free
+    }
+    for n in (2, 3) if len(free) <= 5 else (2,):
+        for team in permutations(free, n):
+            joint = [goals for goals in permutations(free, n) if goals != team]
+            count = len(joint)
+            positions, targets = np.array([team] * count, np.int32), np.array(joint, np.int32)
+            values = np.array(
+                [
+                    [[-wishes[cell, goal].index(a) for a in range(5)] for cell, goal in zip(team, goals, strict=True)]
+                    for goals in joint
+                ],
+                np.float32,
+            )
+            many = np.broadcast_to(maps, (count, *maps.shape[1:])).copy()
+            zeros = np.zeros((count, n), np.int32) + np.arange(n, 0, -1, dtype=np.int32)
+            tables = rules.distance_tables(many, 2, targets)
+            seeds, times = np.zeros(count, np.uint64), np.zeros(count, np.int64)
+            executed = rules.pibt_shield(
+                many, 2, positions, values, zeros, seeds, times, goals=targets, distances=tables
+            )
+            for actions, goals in zip(executed.tolist(), joint, strict=True):
+                after = [oracles.moved(cell, action) for cell, action in zip(team, actions, strict=True)]
+                assert oracles.faults(grid, team, after) == []
+                order = range(n)
+                moves = [wishes[cell, goal] for cell, goal in zip(team, goals, strict=True)]
+                assert actions == oracles.pibt(grid, team, order, moves, goals)
+
+
+def test_two_robots_change_places_in_a_corridor_with_one_branch() -> None:
+    grid, generator = np.array([[0] * 9, [1, 0, *[1] * 7]], bool), np.random.default_rng(0)
+    facing = Instance(grid, [(0, 3), (0, 8)], [(0, 8), (0, 3)])
+    tables = [oracles.distances(grid, goal) for goal in oracles.cells(facing.goals)]
+    arrived = {}
+    for shield in ("pibt", "pibt_swap"):
+        env = BatchedEnv(1, num_agents=2, height=2, width=9, density=0, shield=shield, max_cycles=60)
+        env.reset(0, instances=[facing])
+        arrived[shield] = False
+        for _ in range(60):
+            team = oracles.cells(env.positions[0])
+            ways = [
+                [table.get(oracles.moved(cell, action), 99) for action in range(5)]
+                for cell, table in zip(team, tables, strict=True)
+            ]
+            ties = generator.random((1, 2, 5), np.float32) / 2
+            step = env.step(ties - np.array(ways, np.float32))
+            arrived[shield] |= bool(step.terminated[0])
+            if arrived[shield]:
+                break
+    assert arrived == {"pibt": False, "pibt_swap": True}
+
+
 @given(strategies.crowds(max_side=4, max_agents=3), st.data(), strategies.seeds)
 @hypothesis_settings(max_examples=50)
 def test_what_pibt_draws_by_lot_are_equal_priorities_and_the_last_of_the_preferences(
@@ -200,11 +287,17 @@ def pibt_alone(
     under_way: Sequence[int],
     seed: int,
     time: int = 0,
+    goals: Sequence[oracles.Cell] | None = None,
 ) -> list[int]:
-    """What the PIBT shield executes for one team."""
+    """What the PIBT shield executes for one team, with swaps if it has goals."""
     maps, positions = rules.bordered(grid[None], 2), np.array([team], np.int32)
     waits, seeds, times = np.array([under_way], np.int32), np.array([seed], np.uint64), np.array([time])
-    return rules.pibt_shield(maps, 2, positions, wanted, waits, seeds, times)[0].tolist()
+    if goals is None:
+        return rules.pibt_shield(maps, 2, positions, wanted, waits, seeds, times)[0].tolist()
+    targets = np.array([goals], np.int32)
+    tables = rules.distance_tables(maps, 2, targets)
+    executed = rules.pibt_shield(maps, 2, positions, wanted, waits, seeds, times, goals=targets, distances=tables)
+    return executed[0].tolist()
 
 
 @given(strategies.crowds(max_side=5), st.data(), strategies.seeds)
@@ -635,7 +728,7 @@ def test_wrong_values_of_actions_are_refused() -> None:
     idle, pibt = BatchedEnv(1, num_agents=2), BatchedEnv(1, num_agents=2, shield="pibt")
     for env in (idle, pibt):
         env.reset(seed=0)
-    with pytest.raises(ValueError, match='need shield="pibt"'):
+    with pytest.raises(ValueError, match='need a shield other than "idle"'):
         idle.step(np.zeros((1, 2, 5)))
     with pytest.raises(ValueError, match=r"values of actions must have shape \(1, 2, 5\), got \(1, 2, 4\)"):
         pibt.step(np.zeros((1, 2, 4)))
