@@ -1,19 +1,25 @@
 """The teachers: solvers that take an instance and give a solution."""
 
 from experts.ecbs import solve
+from experts.labels import PlanLabels, label_plans
 from experts.lazy_constraints import lacam
 from experts.many import Solver, audited, solve_many, solve_stream
 from experts.paths import load_paths, save_paths
 from experts.prioritised_planning import prioritised
 from experts.priority_inheritance import pibt
 from experts.relabelling import relabel
-from experts.result import Result, Status
+from experts.result import FoundBy, Result, Status
+from experts.rolling_horizon import RollingHorizon
 
 __all__ = [
+    "FoundBy",
+    "PlanLabels",
     "Result",
+    "RollingHorizon",
     "Solver",
     "Status",
     "audited",
+    "label_plans",
     "lacam",
     "load_paths",
     "pibt",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
-from mapf_env.arguments import MOST_THREADS, cells, each_of, instance_of, integer, number, seed
+from mapf_env.arguments import MOST_THREADS, cells, each_of, flag, instance_of, integer, number, seed
 
 __all__ = [
     "MOST_THREADS",
     "at_least_one",
     "cells",
     "each_of",
+    "flag",
     "improvement",
     "instance_of",
     "seconds",
@@ -22,11 +23,19 @@ DEFAULT_W = 1.05
 DEFAULT_TIME_LIMIT = 10.0
 DEFAULT_NODE_LIMIT = 1_000_000
 DEFAULT_RELABEL_NODE_LIMIT = 10_000
+DEFAULT_LABEL_W = 1.2
+DEFAULT_LABEL_STEPS = 32
+DEFAULT_LABEL_NODE_LIMIT = 20_000
+DEFAULT_ROUNDS = 500
+DEFAULT_WINDOW = 10
+DEFAULT_WINDOW_ROUNDS = 200
 DEFAULT_BACKLOG = 64
 DEFAULT_MAX_STEPS = 1_000
 DEFAULT_MAX_ORDERS = 100
 MAX_STEPS = 2**31 - 2
 MAX_ORDERS = 2**31 - 1
+MAX_WINDOW = 1_000
+MAX_ROUNDS = 2**31 - 1
 
 
 def suboptimality(w: float) -> float:

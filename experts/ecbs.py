@@ -21,15 +21,16 @@ def solve(
 
     Enhanced conflict-based search (Barer, Sharon, Stern and Felner 2014) with all of `w` spent on the choice between
     joint plans and none on single paths, which keeps makespans short. What a few expansions do not solve, large
-    neighbourhood search (Li et al. 2021, 2022) and best-first search with a proof (Li et al. 2019) share in turns.
+    neighbourhood search (Li et al. 2021, 2022), LaCAM (Okumura 2023) and best-first search with a proof (Li et al.
+    2019) share in turns.
     `w=1` is optimal conflict-based search (Sharon, Stern, Felner and Sturtevant 2015).
 
     Args:
         instance: The problem; `instance.at(positions)` asks from any later state.
         w: The suboptimality factor, at least 1: `cost <= w * lower_bound` holds for every solved result.
         time_limit: Seconds of wall-clock time, `math.inf` for none.
-        node_limit: High-level nodes to generate at most; this bounds the memory (about 160 bytes a node on 20x20, up to
-            twice that while arrays grow).
+        node_limit: High-level nodes to generate at most, and for `w` > 1 joint states of LaCAM; this bounds the memory
+            (about 160 bytes a node on 20x20, up to twice that while arrays grow; 8 bytes a robot for a joint state).
         seed: Shuffles the order in which the first joint plan treats the robots.
 
     Returns:

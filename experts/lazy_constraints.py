@@ -20,16 +20,17 @@ def lacam(
     """Finds a plan by lazy constraints addition search, and improves it if that is asked for.
 
     Okumura 2023, "LaCAM: search-based algorithm for quick multi-agent pathfinding": a depth-first search over joint
-    states whose successors PIBT makes, complete because all constraints on a successor are tried in the end. A plan is
-    then improved by large neighbourhood search (Li et al. 2021) until it costs at most `w` times the sum of the
-    distances, or time is up. This is not LaCAM*, whose plans become optimal in the end.
+    states whose successors PIBT with swap makes, complete because all constraints on a successor are tried in the end.
+    It takes turns with searches that begin again with other random choices, also from the goals. A plan is then
+    improved by large neighbourhood search (Li et al. 2021) until it costs at most `w` times the sum of the distances,
+    or time is up. This is not LaCAM*, whose plans become optimal in the end.
 
     Args:
         instance: The problem.
         w: Where improvement stops, at least 1; by default the first plan is returned as it is.
         time_limit: Seconds of wall-clock time, `math.inf` for none. A plan found earlier is returned.
-        node_limit: Joint states to generate at most, of about 8 bytes a robot. Where hardly any joint move is possible
-            many are tried for each state, which only time_limit bounds.
+        node_limit: Joint states to generate at most, of about 8 bytes a robot; at most four times as many successors
+            are tried, which matters where hardly any joint move is possible.
         seed: Draws the order of equally good moves and of constraints.
 
     Returns:

@@ -15,29 +15,33 @@ def relabel(
     instances: Instance | Sequence[Instance],
     positions: npt.ArrayLike,
     *,
+    offsets: npt.ArrayLike | None = None,
     w: float = arguments.DEFAULT_W,
     node_limit: int = arguments.DEFAULT_RELABEL_NODE_LIMIT,
     threads: int = 1,
     seed: int = 0,
 ) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
-    """The expert's first joint action in each of B states of N robots.
+    """The expert's first joint action in each of B states.
 
     For each state it is the first action of `solve(instance.at(positions[b]), w=w, node_limit=node_limit, seed=seed)`,
     at a fraction of the time: the distance tables of an instance are computed once for all its states, also where the
     same `Instance` object occurs many times in a sequence. There is no time limit, so labels are reproducible.
 
     Args:
-        instances: The instance that all states belong to, or a sequence of B instances, one for each state. All have
-            the same number N of robots; maps may differ.
-        positions: (B, N, 2) integers, the row and column of each robot in each state.
+        instances: The instance that all states belong to, or a sequence of B instances, one for each state. Maps and,
+            with `offsets`, team sizes may differ.
+        positions: (B, N, 2) integers, the row and column of each robot in each state; with `offsets` (R, 2), the robots
+            of all states one after the other.
+        offsets: (B + 1,) integers for states of different team sizes: the robots of state b are those from `offsets[b]`
+            to `offsets[b + 1]`. `PlanLabels` has positions and offsets of this form.
         w: The suboptimality factor, at least 1.
         node_limit: High-level nodes to generate at most for a state.
         threads: Threads to share the states; the labels do not depend on it.
         seed: As in `solve`.
 
     Returns:
-        `actions` (B, N) int8, the `Action` of each robot, and `solved` (B,) bool. Where a state is not solved within
-        the limit, all its actions are IDLE; leave it out of the training data.
+        `actions` (B, N) int8, or (R,) with `offsets`, the `Action` of each robot, and `solved` (B,) bool. Where a state
+        is not solved within the limit, all its actions are IDLE; leave it out of the training data.
 
     Raises:
         ValueError: If an argument is out of its range, shapes do not fit, or a state is invalid (off the map, on an
@@ -45,32 +49,49 @@ def relabel(
         TypeError: If an argument has the wrong type.
         KeyboardInterrupt: At Ctrl-C.
     """
-    states = arguments.cells(positions, "positions", "(B, N, 2)", ": N cells for each of B states")
+    flat, spans = _flat(positions, offsets)
     if isinstance(instances, Instance):
         problems = [instances]
-        problem_of = np.zeros(len(states), dtype=np.int64)
+        problem_of = np.zeros(len(spans) - 1, dtype=np.int64)
     else:
         problems, problem_of = _distinct(list(arguments.each_of(instances, Instance, "instances")))
-        if len(problem_of) != len(states):
+        if len(problem_of) != len(spans) - 1:
             raise ValueError(
-                f"{len(problem_of)} instances but positions of {len(states)} states: give one instance for each state, "
-                "or a single Instance that all states belong to"
+                f"{len(problem_of)} instances but positions of {len(spans) - 1} states: give one instance for each "
+                "state, or a single Instance that all states belong to"
             )
-    for problem in problems:
-        if problem.num_agents != states.shape[1]:
-            raise ValueError(
-                f"positions hold {states.shape[1]} agents, but an instance has {problem.num_agents}: all instances and "
-                "states of one call need the same number of agents"
-            )
-    return _native.relabel(
+    sizes = np.diff(spans)
+    teams = np.array([problem.num_agents for problem in problems], np.int64)[problem_of]
+    for state in np.flatnonzero(sizes != teams):
+        raise ValueError(
+            f"state {state} holds {sizes[state]} agents, but an instance has {teams[state]}: give each state the "
+            "robots of its instance, and offsets where team sizes differ"
+        )
+    actions, solved = _native.relabel(
         [(problem.grid, problem.goals) for problem in problems],
         problem_of,
-        states,
+        flat,
+        spans,
         arguments.suboptimality(w),
         arguments.at_least_one(node_limit, "node_limit"),
         arguments.seed(seed),
         arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS),
     )
+    return (actions.reshape(np.shape(positions)[:2]) if offsets is None else actions), solved
+
+
+def _flat(
+    positions: npt.ArrayLike, offsets: npt.ArrayLike | None
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+    """The robots of all states (R, 2), and where each state begins and ends among them (B + 1,)."""
+    if offsets is None:
+        states = arguments.cells(positions, "positions", "(B, N, 2)", ": N cells for each of B states")
+        return states.reshape(-1, 2), np.arange(len(states) + 1) * states.shape[1]
+    flat = arguments.cells(positions, "positions", "(R, 2)", ": the cells of the robots of all states")
+    spans = arguments.cells(offsets, "offsets", "(B + 1,)", filled=True)
+    if spans[0] != 0 or spans[-1] != len(flat) or (np.diff(spans) < 1).any():
+        raise ValueError(f"offsets must rise from 0 to the number of robots, {len(flat)}, got {spans}")
+    return flat, spans.astype(np.int64)
 
 
 def _distinct(instances: list[Instance]) -> tuple[list[Instance], npt.NDArray[np.int64]]:

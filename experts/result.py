@@ -22,6 +22,25 @@ class Status(StrEnum):
     STEP_LIMIT = "step_limit"
 
 
+class FoundBy(StrEnum):
+    """The part of a solver that found a plan."""
+
+    ECBS = "ecbs"
+    """The best-first search of ECBS."""
+    REPAIR = "repair"
+    """Large neighbourhood search, which repaired the first joint plan of ECBS."""
+    PROOF = "proof"
+    """The search that proves lower bounds."""
+    LACAM = "lacam"
+    """LaCAM: its first plan."""
+    IMPROVEMENT = "improvement"
+    """LaCAM's plan, improved by large neighbourhood search."""
+    PRIORITISED = "prioritised"
+    """Prioritised planning."""
+    PIBT = "pibt"
+    """PIBT, step by step."""
+
+
 @dataclass(frozen=True, slots=True)
 class Result:
     """The outcome of one search.
@@ -34,6 +53,8 @@ class Result:
         expansions: High-level nodes expanded (PIBT: joint steps; prioritised planning: orders tried).
         generated: High-level nodes generated, the same way.
         seconds: Wall-clock time of the search, distance tables included.
+        found_by: The part of the solver that found the solution, a `FoundBy` of the solvers here; None without a
+            solution, or where a solver of your own does not say.
 
     Raises:
         ValueError: If status, cost or bound contradict the solution, or a number is negative.
@@ -47,6 +68,7 @@ class Result:
     expansions: int
     generated: int
     seconds: float
+    found_by: str | None = None
 
     def __post_init__(self) -> None:
         arguments.instance_of(self.status, Status, "status")
@@ -63,6 +85,8 @@ class Result:
             arguments.integer(getattr(self, name), name, 0)
         if not arguments.number(self.seconds, "seconds") >= 0:
             raise ValueError(f"seconds must not be negative, got {self.seconds}")
+        if self.found_by is not None:
+            arguments.instance_of(self.found_by, str, "found_by")
 
     @classmethod
     def of(cls, solution: Solution, *, lower_bound: int = 0, seconds: float = 0.0) -> Result:
@@ -82,14 +106,16 @@ class Result:
 
 
 _STATUSES = tuple(Status)  # the native enumeration has the same order
+FINDERS = (None, *FoundBy)
+"""The parts that find plans, in the order of the native enumeration."""
 
-Parts = tuple[int, npt.NDArray[np.int32] | None, int, int, int, int, float]
-"""A result as the native solvers give it: status number, paths, cost, bound, expansions, generated, seconds."""
+Parts = tuple[int, npt.NDArray[np.int32] | None, int, int, int, int, float, int]
+"""A native result: status number, paths, cost, bound, expansions, generated, seconds, number of the finder."""
 
 
 def as_result(parts: Parts) -> Result:
     """The result made of native parts."""
-    status, paths, cost, lower_bound, expansions, generated, seconds = parts
+    status, paths, cost, lower_bound, expansions, generated, seconds, finder = parts
     solution = None if paths is None else Solution(paths)
     paid = None if paths is None else cost
-    return Result(_STATUSES[status], solution, paid, lower_bound, expansions, generated, seconds)
+    return Result(_STATUSES[status], solution, paid, lower_bound, expansions, generated, seconds, FINDERS[finder])

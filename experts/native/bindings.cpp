@@ -10,14 +10,20 @@
 #include <limits>
 #include <numeric>
 #include <optional>
+#include <stdexcept>
+#include <string>
 #include <tuple>
+#include <utility>
 
 #include "experts/native/ecbs.hpp"
+#include "experts/native/improvement.hpp"
+#include "experts/native/labels.hpp"
 #include "experts/native/lacam.hpp"
 #include "experts/native/neighbourhood_search.hpp"
 #include "experts/native/pibt.hpp"
 #include "experts/native/prioritised.hpp"
 #include "experts/native/relabel.hpp"
+#include "experts/native/rolling_horizon.hpp"
 #include "experts/native/work_queue.hpp"
 #include "mapf_env/native/arrays.hpp"
 
@@ -33,9 +39,9 @@ using GridArray = In<bool, 2>;
 using CellsArray = In<std::int32_t, 2>;
 using InstanceArrays = std::tuple<GridArray, CellsArray, CellsArray>;
 
-// What Python's Result is made of: status, paths, cost, lower bound, expansions, generated, seconds.
-using ResultParts =
-    std::tuple<int, std::optional<Out<std::int32_t>>, std::int64_t, std::int64_t, std::size_t, std::size_t, double>;
+// What Python's Result is made of: status, paths, cost, lower bound, expansions, generated, seconds, found by.
+using ResultParts = std::tuple<int, std::optional<Out<std::int32_t>>, std::int64_t, std::int64_t, std::size_t,
+                               std::size_t, double, int>;
 
 mapf::Grid as_grid(const GridArray& grid) {
     return {reinterpret_cast<const std::uint8_t*>(grid.data()), static_cast<int>(grid.shape(0)),
@@ -69,6 +75,7 @@ struct Outcome {
     std::int64_t cost = 0, lower_bound = 0;
     std::size_t expansions = 0, generated = 0;
     double seconds = 0;
+    mapf::FoundBy found_by = mapf::FoundBy::none;
 };
 
 struct Workspace {
@@ -127,7 +134,10 @@ Outcome run_ecbs(const InstanceArrays& arrays, const mapf::EcbsOptions& options,
         outcome.lower_bound = ecbs.lower_bound();
         outcome.expansions = ecbs.expansions();
         outcome.generated = ecbs.generated();
-        if (outcome.status == mapf::Status::solved) write_plan(grid.layout, starts, ecbs, outcome);
+        if (outcome.status == mapf::Status::solved) {
+            write_plan(grid.layout, starts, ecbs, outcome);
+            outcome.found_by = ecbs.found_by();
+        }
     }
     outcome.seconds = budget.seconds();
     return outcome;
@@ -141,7 +151,7 @@ ResultParts as_parts(const Outcome& outcome, std::size_t num_robots) {
         paths = array;
     }
     return {static_cast<int>(outcome.status), paths, outcome.cost, outcome.lower_bound, outcome.expansions,
-            outcome.generated, outcome.seconds};
+            outcome.generated, outcome.seconds, static_cast<int>(outcome.found_by)};
 }
 
 std::vector<ResultParts> ecbs(const std::vector<InstanceArrays>& instances, double w, double time_limit,
@@ -162,10 +172,11 @@ std::vector<ResultParts> ecbs(const std::vector<InstanceArrays>& instances, doub
 }
 
 std::pair<Out<std::int8_t>, Out<bool>> relabel(const std::vector<std::pair<GridArray, CellsArray>>& problems,
-                                               In<std::int64_t, 1> problem_of, In<std::int32_t, 3> positions, double w,
-                                               std::size_t node_limit, std::uint64_t seed, int threads) {
-    const std::size_t num_states = positions.shape(0), num_robots = positions.shape(1);
-    auto [actions, actions_array] = mapf::make_array<std::int8_t>({num_states, num_robots});
+                                               In<std::int64_t, 1> problem_of, In<std::int32_t, 2> positions,
+                                               In<std::int64_t, 1> offsets, double w, std::size_t node_limit,
+                                               std::uint64_t seed, int threads) {
+    const std::size_t num_states = problem_of.shape(0);
+    auto [actions, actions_array] = mapf::make_array<std::int8_t>({positions.shape(0)});
     auto [solved, solved_array] = mapf::make_array<bool>({num_states});
     std::vector<mapf::GoalsOnGrid> goals;
     goals.reserve(problems.size());
@@ -174,11 +185,66 @@ std::pair<Out<std::int8_t>, Out<bool>> relabel(const std::vector<std::pair<GridA
         auto flat = as_cells(map.layout, cells);
         goals.push_back({std::move(map), std::move(flat)});
     }
-    const mapf::States states{num_states, num_robots, positions.data(), problem_of.data()};
+    const mapf::States states{num_states, positions.data(), offsets.data(), problem_of.data()};
     run_without_gil([&, actions = actions, solved = solved](mapf::Interrupt& interrupt) {
         mapf::relabel(goals, states, {w, node_limit, seed}, threads, interrupt, actions, solved);
     });
     return {actions_array, solved_array};
+}
+
+// What Python's PlanLabels is made of: source, time, offsets, positions, actions, solved, cost, found by.
+using LabelParts = std::tuple<Out<std::int64_t>, Out<std::int32_t>, Out<std::int64_t>, Out<std::int32_t>,
+                              Out<std::int8_t>, Out<bool>, Out<std::int64_t>, std::vector<int>>;
+
+LabelParts label_plans(const std::vector<InstanceArrays>& instances, int steps, double w, std::size_t node_limit,
+                       int rounds, std::uint64_t seed, int threads) {
+    std::vector<mapf::Team> cases;
+    cases.reserve(instances.size());
+    for (const auto& [grid, starts, goals] : instances) {
+        auto map = as_grid(grid);
+        auto from = as_cells(map.layout, starts), to = as_cells(map.layout, goals);
+        cases.push_back({std::move(map), std::move(from), std::move(to)});
+    }
+    std::vector<mapf::PlanLabels> labels;
+    run_without_gil([&](mapf::Interrupt& interrupt) {
+        labels = mapf::label_plans(cases, {steps, w, node_limit, rounds, seed}, threads, interrupt);
+    });
+    std::size_t num_states = 0, num_robots = 0;
+    for (std::size_t i = 0; i < cases.size(); ++i) {
+        num_states += static_cast<std::size_t>(labels[i].steps);
+        num_robots += static_cast<std::size_t>(labels[i].steps) * cases[i].starts.size();
+    }
+    auto [source, source_array] = mapf::make_array<std::int64_t>({num_states});
+    auto [time, time_array] = mapf::make_array<std::int32_t>({num_states});
+    auto [offset, offsets_array] = mapf::make_array<std::int64_t>({num_states + 1});
+    auto [position, positions_array] = mapf::make_array<std::int32_t>({num_robots, 2});
+    auto [action, actions_array] = mapf::make_array<std::int8_t>({num_robots});
+    auto [solved, solved_array] = mapf::make_array<bool>({cases.size()});
+    auto [cost, cost_array] = mapf::make_array<std::int64_t>({cases.size()});
+    std::vector<int> found_by;
+    *offset = 0;
+    for (std::size_t i = 0; i < cases.size(); ++i) {
+        const auto& layout = cases[i].grid.layout;
+        const auto directions = layout.steps();
+        auto cells = cases[i].starts;
+        auto next = labels[i].actions.begin();
+        solved[i] = labels[i].found_by != mapf::FoundBy::none;
+        cost[i] = labels[i].cost;
+        found_by.push_back(static_cast<int>(labels[i].found_by));
+        for (int at = 0; at < labels[i].steps; ++at) {
+            *source++ = static_cast<std::int64_t>(i);
+            *time++ = at;
+            offset[1] = offset[0] + static_cast<std::int64_t>(cells.size());
+            ++offset;
+            for (auto& cell : cells) {
+                *position++ = layout.row(cell);
+                *position++ = layout.col(cell);
+                *action++ = static_cast<std::int8_t>(*next);
+                cell += directions[*next++];
+            }
+        }
+    }
+    return {source_array, time_array, offsets_array, positions_array, actions_array, solved_array, cost_array, found_by};
 }
 
 // One search in the calling thread: search(problem's grid, starts, goals, budget, outcome).
@@ -195,8 +261,8 @@ ResultParts run_one(const GridArray& grid_array, const CellsArray& start_cells, 
     return as_parts(outcome, start_cells.shape(0));
 }
 
-ResultParts pibt(const GridArray& grids, const CellsArray& start_cells, const CellsArray& goal_cells, int max_steps,
-                 std::uint64_t seed) {
+ResultParts pibt(const GridArray& grids, const CellsArray& start_cells, const CellsArray& goal_cells, bool swap,
+                 int max_steps, std::uint64_t seed) {
     constexpr double no_limit = std::numeric_limits<double>::infinity();
     return run_one(grids, start_cells, goal_cells, no_limit, [&](const mapf::Grid& grid, const std::vector<int>& starts,
                                                                  const std::vector<int>& goals, mapf::Budget& budget,
@@ -204,13 +270,14 @@ ResultParts pibt(const GridArray& grids, const CellsArray& start_cells, const Ce
         mapf::DistanceTables distances;
         if (!distances.compute(grid, goals, budget)) return;
         const mapf::Problem problem{grid, starts, goals, distances};
-        const auto run = mapf::run_pibt(problem, max_steps, seed, budget);
+        const auto run = mapf::run_pibt(problem, swap, max_steps, seed, budget);
         const auto num_robots = starts.size();
         const int steps = static_cast<int>(run.actions.size() / num_robots);
         outcome.expansions = outcome.generated = static_cast<std::size_t>(steps);
         outcome.lower_bound = sum_of_distances(problem);
         outcome.status = run.solved ? mapf::Status::solved : mapf::Status::step_limit;
         if (!run.solved) return;
+        outcome.found_by = mapf::FoundBy::pibt;
         outcome.cost = std::accumulate(run.arrivals.begin(), run.arrivals.end(), std::int64_t{0});
         outcome.paths = write_paths(grid.layout, starts, steps, [&](std::size_t robot, int time) {
             return run.actions[static_cast<std::size_t>(time - 1) * num_robots + robot];
@@ -230,22 +297,10 @@ ResultParts prioritised(const GridArray& grids, const CellsArray& start_cells, c
                        outcome.lower_bound = sum_of_distances(problem);
                        outcome.status = planning.run(problem, max_orders, seed, budget);
                        outcome.expansions = outcome.generated = planning.orders();
-                       if (outcome.status == mapf::Status::solved) write_plan(grid.layout, starts, planning, outcome);
+                       if (outcome.status != mapf::Status::solved) return;
+                       write_plan(grid.layout, starts, planning, outcome);
+                       outcome.found_by = mapf::FoundBy::prioritised;
                    });
-}
-
-// Improves the plan of `lacam` until it costs at most w times the lower bound or time is up.
-void improve(const mapf::Grid& grid, const std::vector<int>& starts, const std::vector<int>& goals,
-             const mapf::JointPlan& plan, double w, std::uint64_t seed, mapf::Budget& budget, Outcome& outcome) {
-    write_plan(grid.layout, starts, plan, outcome);
-    const auto target = mapf::cost_limit(w, outcome.lower_bound);
-    mapf::DistanceTables distances;
-    if (outcome.cost <= target || !distances.compute(grid, goals, budget)) return;
-    const mapf::Problem problem{grid, starts, goals, distances};
-    mapf::NeighbourhoodSearch neighbourhoods;
-    neighbourhoods.begin(problem, seed, [&](std::size_t robot) { return plan.actions(robot); });
-    neighbourhoods.run(target, std::numeric_limits<int>::max(), budget);
-    if (neighbourhoods.cost() < outcome.cost) write_plan(grid.layout, starts, neighbourhoods, outcome);
 }
 
 ResultParts lacam(const GridArray& grids, const CellsArray& start_cells, const CellsArray& goal_cells, double w,
@@ -254,13 +309,66 @@ ResultParts lacam(const GridArray& grids, const CellsArray& start_cells, const C
                    [&](const mapf::Grid& grid, const std::vector<int>& starts, const std::vector<int>& goals,
                        mapf::Budget& budget, Outcome& outcome) {
                        mapf::Lacam search(grid, starts, goals, seed);
-                       outcome.status = search.run(node_limit, budget);
+                       outcome.status = search.run(mapf::Lacam::limits_of(node_limit), budget);
                        outcome.lower_bound = search.lower_bound();
                        outcome.expansions = search.expansions();
                        outcome.generated = search.generated();
-                       if (outcome.status == mapf::Status::solved)
-                           improve(grid, starts, goals, search.plan(), w, seed, budget, outcome);
+                       if (outcome.status != mapf::Status::solved) return;
+                       auto plan = search.plan();
+                       outcome.found_by = mapf::FoundBy::lacam;
+                       const auto target = mapf::cost_limit(w, outcome.lower_bound);
+                       mapf::DistanceTables distances;
+                       if (plan.cost() > target && distances.compute(grid, goals, budget)) {
+                           mapf::NeighbourhoodSearch neighbourhoods;
+                           const mapf::Problem problem{grid, starts, goals, distances};
+                           constexpr int all = std::numeric_limits<int>::max();
+                           if (mapf::improve(problem, target, all, seed, plan, neighbourhoods, budget))
+                               outcome.found_by = mapf::FoundBy::improvement;
+                       }
+                       write_plan(grid.layout, starts, plan, outcome);
                    });
+}
+
+[[noreturn]] void reject_robot(const char* array, std::size_t robot, int row, int col, const char* what) {
+    throw std::invalid_argument(std::string(array) + "[" + std::to_string(robot) + "]: agent " + std::to_string(robot) +
+                                " at (" + std::to_string(row) + ", " + std::to_string(col) + ") " + what);
+}
+
+// The cells of the robots; throws std::invalid_argument if one lies off the map or on an obstacle.
+std::vector<int> checked_cells(const mapf::Grid& grid, const CellsArray& cells, const char* name) {
+    for (std::size_t robot = 0; robot < cells.shape(0); ++robot) {
+        const int row = cells(robot, 0), col = cells(robot, 1);
+        if (!grid.layout.contains(row, col)) reject_robot(name, robot, row, col, "lies outside the map");
+        if (grid.blocked[grid.layout.cell(row, col)]) reject_robot(name, robot, row, col, "lies on an obstacle");
+    }
+    return as_cells(grid.layout, cells);
+}
+
+// Plans on; the joint actions (window, N) of the plan.
+Out<std::int8_t> plan_window(mapf::RollingHorizon& planner, const CellsArray& positions, const CellsArray& goals,
+                             int executed) {
+    const auto cells = checked_cells(planner.grid(), positions, "positions");
+    const auto targets = checked_cells(planner.grid(), goals, "goals");
+    const auto num_robots = cells.size();
+    std::vector<std::uint8_t> taken(planner.grid().blocked.size(), 0);
+    for (std::size_t robot = 0; robot < num_robots; ++robot)
+        if (std::exchange(taken[cells[robot]], std::uint8_t{1}))
+            reject_robot("positions", robot, positions(robot, 0), positions(robot, 1), "shares its cell with another agent");
+    const auto window = static_cast<std::size_t>(planner.window());
+    auto [data, array] = mapf::make_array<std::int8_t>({window, num_robots});
+    run_without_gil([&, data = data](mapf::Interrupt& interrupt) {
+        mapf::Budget budget(std::numeric_limits<double>::infinity(), interrupt, true);
+        for (std::size_t robot = 0; robot < num_robots; ++robot)
+            if (!planner.reaches(cells[robot], targets[robot]))
+                reject_robot("positions", robot, positions(robot, 0), positions(robot, 1),
+                             "cannot reach its goal: obstacles separate them");
+        planner.plan(cells, targets, executed, budget);
+        for (std::size_t time = 0; time < window; ++time)
+            for (std::size_t robot = 0; robot < num_robots; ++robot)
+                data[time * num_robots + robot] =
+                    static_cast<std::int8_t>(planner.action(robot, static_cast<int>(time)));
+    });
+    return array;
 }
 
 }  // namespace
@@ -269,9 +377,19 @@ NB_MODULE(_native, m) {
     m.doc() = "Native solvers: arguments are checked in Python, statuses are the positions of the members of Status.";
     m.def("ecbs", &ecbs, "instances"_a, "w"_a, "time_limit"_a, "node_limit"_a, "seed"_a, "threads"_a,
           "Solves each instance (grid, starts, goals); see experts.solve_many.");
-    m.def("relabel", &relabel, "problems"_a, "problem_of"_a, "positions"_a, "w"_a, "node_limit"_a, "seed"_a,
+    m.def("relabel", &relabel, "problems"_a, "problem_of"_a, "positions"_a, "offsets"_a, "w"_a, "node_limit"_a, "seed"_a,
           "threads"_a, "First joint action for each state; see experts.relabel.");
-    m.def("pibt", &pibt, "grid"_a, "starts"_a, "goals"_a, "max_steps"_a, "seed"_a,
+    m.def("label_plans", &label_plans, "instances"_a, "steps"_a, "w"_a, "node_limit"_a, "rounds"_a, "seed"_a,
+          "threads"_a, "Solves each instance once and labels the states on its plan; see experts.label_plans.");
+    nb::class_<mapf::RollingHorizon>(m, "RollingHorizon", "Plans a few steps ahead; see experts.RollingHorizon.")
+        .def("__init__",
+             [](mapf::RollingHorizon* self, const GridArray& grid, int window, int rounds, std::uint64_t seed) {
+                 new (self) mapf::RollingHorizon(as_grid(grid), window, rounds, seed);
+             },
+             "grid"_a, "window"_a, "rounds"_a, "seed"_a)
+        .def("plan", &plan_window, "positions"_a, "goals"_a, "executed"_a,
+             "Joint actions (window, N), after `executed` steps of the last plan.");
+    m.def("pibt", &pibt, "grid"_a, "starts"_a, "goals"_a, "swap"_a, "max_steps"_a, "seed"_a,
           "Runs PIBT; see experts.pibt.");
     m.def("prioritised", &prioritised, "grid"_a, "starts"_a, "goals"_a, "max_orders"_a, "time_limit"_a, "seed"_a,
           "Prioritised planning; see experts.prioritised.");

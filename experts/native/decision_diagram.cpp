@@ -13,36 +13,38 @@ constexpr std::size_t most_joint_states = 20'000;
 
 }  // namespace
 
-void DiagramBuilder::build(const Grid& grid, int start, int goal, const Distance* distance, const Rules& rules,
+void DiagramBuilder::build(const Grid& grid, int start, int goal, const Distance* distance, const Constraints& constraints,
                            DecisionDiagram& diagram, Budget& budget) {
     distance_ = distance;
     steps_ = grid.layout.steps();
+    // Read the constraints: no path is shorter than `shortest`, and after `last_constraint` nothing changes any more.
     closed_from_.resize(grid.blocked.size(), forever);
     index_of_.resize(grid.blocked.size());
     banned_.clear();
-    int shortest = std::max<int>(distance[start], rules.earliest), last_rule = 0;
-    for (const auto& ban : rules.bans) {
+    int shortest = std::max<int>(distance[start], constraints.earliest), last_constraint = 0;
+    for (const auto& ban : constraints.bans) {
         banned_(ban.cell, ban.time) |= ban.actions;
-        last_rule = std::max(last_rule, ban.time);
+        last_constraint = std::max(last_constraint, ban.time);
         if (ban.cell == goal && ban.actions == all_actions) shortest = std::max(shortest, ban.time + 1);
     }
-    for (const auto& closure : rules.closures) {
-        closed_from_[closure.cell] = std::min(closed_from_[closure.cell], closure.time);
-        last_rule = std::max(last_rule, closure.time);
+    for (const auto& closed : constraints.closed_cells) {
+        closed_from_[closed.cell] = std::min(closed_from_[closed.cell], closed.time);
+        last_constraint = std::max(last_constraint, closed.time);
     }
+    // Try the shortest lengths one by one; then flood forward for the first arrival that is possible.
     diagram.length = -1;
-    const int last_try = std::min(rules.latest, shortest + short_tries);
+    const int last_try = std::min(constraints.latest, shortest + short_tries);
     int length = shortest;
     while (length <= last_try && !try_length(start, length, diagram, budget)) ++length;
-    if (length > last_try && last_try < rules.latest) {
-        length = first_arrival(start, goal, length, rules.latest, last_rule, budget);
+    if (length > last_try && last_try < constraints.latest) {
+        length = first_arrival(start, goal, length, constraints.latest, last_constraint, budget);
         if (length != forever) try_length(start, length, diagram, budget);
     }
-    for (const auto& closure : rules.closures) closed_from_[closure.cell] = forever;
+    for (const auto& closed : constraints.closed_cells) closed_from_[closed.cell] = forever;
 }
 
 // The first time in earliest..latest at which a robot can arrive, or forever.
-int DiagramBuilder::first_arrival(int start, int goal, int earliest, int latest, int last_rule, Budget& budget) {
+int DiagramBuilder::first_arrival(int start, int goal, int earliest, int latest, int last_constraint, Budget& budget) {
     here_.assign(1, start);
     since_.assign(closed_from_.size(), -1);
     for (int time = 1; time <= latest && !here_.empty(); ++time) {
@@ -62,13 +64,14 @@ int DiagramBuilder::first_arrival(int start, int goal, int earliest, int latest,
         }
         if (arrives && time >= earliest) return time;
         // Once no rule changes any more, cells are only won; the robot has to leave its goal to come back, too.
-        if (time > std::max(last_rule, earliest) + 2 && after_.size() == here_.size()) break;
+        if (time > std::max(last_constraint, earliest) + 2 && after_.size() == here_.size()) break;
         std::swap(here_, after_);
     }
     return forever;
 }
 
 bool DiagramBuilder::try_length(int start, int length, DecisionDiagram& diagram, Budget& budget) {
+    // Forward: level by level, the cells from which the goal can still be reached in time.
     diagram.nodes.clear();
     diagram.level.assign(1, 0);
     const DecisionDiagram::Node nowhere{start, {-1, -1, -1, -1, -1}};
@@ -97,6 +100,7 @@ bool DiagramBuilder::try_length(int start, int length, DecisionDiagram& diagram,
         diagram.level.push_back(static_cast<int>(diagram.nodes.size()));
         if (diagram.level[time + 1] == diagram.level[time]) return false;
     }
+    // Backward: nodes without a way on are dropped.
     diagram.length = length;
     prune(diagram);
     return true;

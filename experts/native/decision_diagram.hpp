@@ -1,4 +1,6 @@
 // All paths of one length: a multi-valued decision diagram (Sharon, Stern, Goldenberg and Felner 2013).
+//
+// Invariant: every path through a diagram obeys the constraints and arrives at its length, and every such path is in it.
 #pragma once
 
 #include <array>
@@ -15,23 +17,23 @@
 namespace mapf {
 
 // What one robot has to obey.
-struct Rules {
+struct Constraints {
     struct Ban {
         int cell, time;
         std::uint8_t actions;  // by which the robot must not arrive (a bit each)
     };
-    struct Closure {
+    struct ClosedCell {
         int cell, time;  // from when on the robot must not be there
     };
     int earliest = 0, latest = forever;  // time of arrival
     std::vector<Ban> bans;
-    std::vector<Closure> closures;
+    std::vector<ClosedCell> closed_cells;
 
     void clear() {
         earliest = 0;
         latest = forever;
         bans.clear();
-        closures.clear();
+        closed_cells.clear();
     }
 };
 
@@ -43,7 +45,7 @@ struct DecisionDiagram {
     };
     static constexpr int none = -1;
 
-    int length = -1;  // -1: no path obeys the rules
+    int length = -1;  // -1: no path obeys the constraints
     std::vector<Node> nodes;
     std::vector<int> level;  // the first node of each time 0..length, and the end
 
@@ -53,11 +55,11 @@ struct DecisionDiagram {
     }
 };
 
-// Builds diagrams of the shortest paths that obey rules, and reads paths out of them.
+// Builds diagrams of the shortest paths that obey constraints, and reads paths out of them.
 class DiagramBuilder {
 public:
     // An unsolvable diagram also if the budget is spent.
-    void build(const Grid& grid, int start, int goal, const Distance* distance, const Rules& rules,
+    void build(const Grid& grid, int start, int goal, const Distance* distance, const Constraints& constraints,
                DecisionDiagram& diagram, Budget& budget);
 
     // Of the paths of `diagram` one with the fewest conflicts with `traffic`; returns their number.
@@ -65,7 +67,7 @@ public:
 
 private:
     bool try_length(int start, int length, DecisionDiagram& diagram, Budget& budget);
-    int first_arrival(int start, int goal, int earliest, int latest, int last_rule, Budget& budget);
+    int first_arrival(int start, int goal, int earliest, int latest, int last_constraint, Budget& budget);
     void prune(DecisionDiagram& diagram);
 
     const Distance* distance_ = nullptr;

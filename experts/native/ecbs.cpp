@@ -8,6 +8,7 @@
 #include <stdexcept>
 
 #include "experts/native/corridor.hpp"
+#include "experts/native/improvement.hpp"
 #include "mapf_env/native/random.hpp"
 
 namespace mapf {
@@ -20,6 +21,7 @@ constexpr std::size_t few_expansions_optimal = 8;  // and for w = 1
 constexpr int few_conflicts = 20;                  // with more of them in the root, other means are tried at once
 constexpr int many_conflicts = 60;                  // with more of them the root is not untangled
 constexpr int first_effort = 64;                  // rounds and nodes of the first turn
+constexpr std::size_t expansions_of_lacam = 64;   // for each of these
 
 }  // namespace
 
@@ -28,8 +30,9 @@ Status Ecbs::solve(const Problem& problem, const EcbsOptions& options, Budget& b
     num_robots_ = problem.starts.size();
     expansions_ = 0;
     cost_ = lower_bound_ = 0;
-    author_ = Author::focal;
+    found_by_ = FoundBy::ecbs;
     proves_ = false;
+    if (hard_) hard_->lacam.reset();
     nodes_.clear();
     paths_.clear();
     actions_.clear();
@@ -50,8 +53,8 @@ Status Ecbs::solve(const Problem& problem, const EcbsOptions& options, Budget& b
             cost_ = nodes_[id].cost;
             return Status::solved;
         }
-        if (nodes_.size() >= options.node_limit) return Status::node_limit;
-        if (expansions_ == patience) return persist(id, options, budget);
+        if (expansions_ == patience || nodes_.size() >= options.node_limit)
+            return options.hard_cases ? solve_hard_case(id, options, budget) : Status::node_limit;
         ++expansions_;
         expand(id, budget);
         if (budget.look()) return Status::time_limit;
@@ -89,48 +92,83 @@ bool Ecbs::plan_root(double w, std::uint64_t seed, Budget& budget) {
     return true;
 }
 
-// What a search of a few nodes did not solve: large neighbourhood search for a plan, from node `id`, and best-first
-// search for a bound that proves it good enough, in turns.
-Status Ecbs::persist(int id, const EcbsOptions& options, Budget& budget) {
+// What a search of a few nodes did not solve: large neighbourhood search for a plan, from node `id` or from LaCAM's plan,
+// and best-first search for a bound that proves it good enough, in turns.
+Status Ecbs::solve_hard_case(int id, const EcbsOptions& options, Budget& budget) {
     if (order_forbids_solution(problem_->grid, problem_->starts, problem_->goals)) return Status::infeasible;
     if (!hard_) hard_ = std::make_unique<HardCases>();
-    auto& [neighbourhoods, proving] = *hard_;
+    auto& neighbourhoods = hard_->neighbourhoods;
+    auto& proving = hard_->proving;
     const auto path_of = [&](std::size_t robot) { return stored(loaded_[robot]); };
     const bool needs_optimum = options.w <= 1;
     if (!needs_optimum) {
         load(id);
         neighbourhoods.begin(*problem_, options.seed, path_of);
+        hard_->plan_of_neighbourhoods = FoundBy::repair;
     }
-    const auto node_limit = options.node_limit - std::min(options.node_limit, nodes_.size());
+    const auto nodes_left = [&] {
+        return options.node_limit - std::min(options.node_limit, nodes_.size() + (proves_ ? proving.generated() : 0));
+    };
     for (int effort = first_effort;; effort += effort) {
         std::int64_t known = std::numeric_limits<std::int64_t>::max();
         if (!needs_optimum) {
+            // Repair: the plan of the neighbourhoods loses its conflicts, then costs.
             const auto target = cost_limit(options.w, lower_bound_);
-            const bool enough = neighbourhoods.run(target, effort, budget);
+            if (neighbourhoods.run(target, effort, budget))
+                return finish(hard_->plan_of_neighbourhoods, neighbourhoods.cost());
+            // Complete search: LaCAM's plan is the incumbent if it is the cheapest so far.
+            const auto more = hard_->lacam_expansions() + static_cast<std::size_t>(effort) * expansions_of_lacam;
+            if (const auto ended = ask_lacam(more, options, budget)) return *ended;
             if (neighbourhoods.feasible()) known = neighbourhoods.cost();
-            if (enough) return finish(Author::repair, known);
         }
+        // Proof: the bound rises.
         if (!proves_) {
             load(0);
             proving.begin(*problem_, path_of);
             proves_ = true;
         }
-        const auto nodes = proving.generated() + static_cast<std::size_t>(effort);
-        const auto outcome =
-            proving.run(options.w, known, needs_optimum ? node_limit : std::min(node_limit, nodes), budget);
+        const auto turn = needs_optimum ? nodes_left() : std::min(nodes_left(), static_cast<std::size_t>(effort));
+        const auto outcome = proving.run(options.w, known, proving.generated() + turn, budget);
         lower_bound_ = std::max(lower_bound_, static_cast<int>(proving.lower_bound()));
         if (outcome == ProvingSearch::Outcome::infeasible) return Status::infeasible;
         if (outcome == ProvingSearch::Outcome::proved) {
             const bool own = proving.has_plan() && proving.cost() <= known;
-            return finish(own ? Author::proof : Author::repair, own ? proving.cost() : known);
+            return finish(own ? FoundBy::proof : hard_->plan_of_neighbourhoods, own ? proving.cost() : known);
         }
         if (budget.look()) return Status::time_limit;
-        if (proving.generated() >= node_limit) return Status::node_limit;
+        if (nodes_left() > 0) continue;
+        if (needs_optimum) return Status::node_limit;
+        return ask_lacam(Lacam::limits_of(options.node_limit).expansions, options, budget).value_or(Status::node_limit);
     }
 }
 
-Status Ecbs::finish(Author author, std::int64_t cost) {
-    author_ = author;
+// Goes on with LaCAM, up to `expansions` in all, if it has no plan yet. Its first plan is returned if that is good
+// enough; if it is cheaper than the plan of the neighbourhood search, that goes on from it.
+std::optional<Status> Ecbs::ask_lacam(std::size_t expansions, const EcbsOptions& options, Budget& budget) {
+    auto& [neighbourhoods, proving, lacam, plan, plan_of_neighbourhoods] = *hard_;
+    if (!lacam) {
+        lacam.emplace(problem_->grid, problem_->starts, problem_->goals, options.seed);
+        plan = {};
+    }
+    if (!plan.of_robot.empty()) return std::nullopt;
+    const auto limits = Lacam::limits_of(options.node_limit);
+    switch (lacam->run({limits.nodes, std::min(limits.expansions, expansions)}, budget)) {
+        case Status::solved: break;
+        case Status::infeasible: return Status::infeasible;
+        default: return std::nullopt;
+    }
+    plan = lacam->plan();
+    const auto target = cost_limit(options.w, lower_bound_);
+    if (plan.cost() <= target) return finish(FoundBy::lacam, plan.cost());
+    replan_tails(*problem_, target, options.seed, plan, budget);
+    if (neighbourhoods.feasible() && neighbourhoods.cost() <= plan.cost()) return std::nullopt;
+    neighbourhoods.begin(*problem_, options.seed, [&](std::size_t robot) { return plan.actions(robot); });
+    plan_of_neighbourhoods = FoundBy::improvement;
+    return std::nullopt;
+}
+
+Status Ecbs::finish(FoundBy author, std::int64_t cost) {
+    found_by_ = author;
     cost_ = static_cast<int>(cost);
     return Status::solved;
 }

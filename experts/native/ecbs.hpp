@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "experts/native/budget.hpp"
+#include "experts/native/lacam.hpp"
 #include "experts/native/neighbourhood_search.hpp"
 #include "experts/native/open_list.hpp"
 #include "experts/native/problem.hpp"
@@ -23,6 +24,7 @@ struct EcbsOptions {
     double w;                // cost <= w * lower bound
     std::size_t node_limit;  // high-level nodes to generate at most
     std::uint64_t seed;      // shuffles the order in which the root plans the robots
+    bool hard_cases = true;  // false: give up, with `node_limit`, on what a few expansions do not solve
 };
 
 // The search and its memory, which the next search of the same thread reuses.
@@ -30,23 +32,30 @@ struct EcbsOptions {
 // Barer, Sharon, Stern and Felner 2014, "Suboptimal variants of the conflict-based search algorithm", with the whole
 // of w spent on the high level: paths are optimal under their constraints, so a node's cost bounds its subtree from
 // below, and makespans stay short. Conflicts are bypassed where that is free (Boyarski et al. 2015). What that does not
-// solve in a few expansions goes to a neighbourhood search, for a plan, and to a proving search, for a bound.
+// solve in a few expansions goes to a neighbourhood search and to LaCAM, for a plan, and to a proving search, for a
+// bound.
 class Ecbs {
 public:
     Status solve(const Problem& problem, const EcbsOptions& options, Budget& budget);
 
     // Of the last search. Each robot's actions until it arrives, if it was solved.
     std::span<const std::uint8_t> actions(std::size_t robot) const {
-        switch (author_) {
-            case Author::repair: return hard_->neighbourhoods.actions(robot);
-            case Author::proof: return hard_->proving.actions(robot);
-            default: return stored(loaded_[robot]);
+        switch (found_by_) {
+            case FoundBy::proof: return hard_->proving.actions(robot);
+            case FoundBy::lacam: return hard_->crowd_plan.actions(robot);
+            case FoundBy::ecbs: return stored(loaded_[robot]);
+            default: return hard_->neighbourhoods.actions(robot);
         }
     }
+    FoundBy found_by() const { return found_by_; }
     int cost() const { return cost_; }
     int lower_bound() const { return lower_bound_; }
     std::size_t expansions() const { return expansions_ + (proves_ ? hard_->proving.expansions() : 0); }
-    std::size_t generated() const { return nodes_.size() + (proves_ ? hard_->proving.generated() : 0); }
+    // Nodes of all searches, the joint states of LaCAM included.
+    std::size_t generated() const {
+        const std::size_t states = hard_ && hard_->lacam ? hard_->lacam->generated() : 0;
+        return nodes_.size() + (proves_ ? hard_->proving.generated() : 0) + states;
+    }
 
 private:
     // Robot `robot` must not arrive in `cell` at `time` by any of `actions` (a bit each).
@@ -74,14 +83,18 @@ private:
     struct HardCases {
         NeighbourhoodSearch neighbourhoods;
         ProvingSearch proving;
+        std::optional<Lacam> lacam;  // of this problem, once it was asked
+        JointPlan crowd_plan;        // its plan
+        FoundBy plan_of_neighbourhoods = FoundBy::repair;
+
+        std::size_t lacam_expansions() const { return lacam ? lacam->expansions() : 0; }
     };
 
     bool plan_root(double w, std::uint64_t seed, Budget& budget);
     bool untangle(Node& root, Budget& budget);
-    enum class Author : std::uint8_t { focal, repair, proof };
-
-    Status persist(int id, const EcbsOptions& options, Budget& budget);
-    Status finish(Author author, std::int64_t cost);
+    Status solve_hard_case(int id, const EcbsOptions& options, Budget& budget);
+    std::optional<Status> ask_lacam(std::size_t expansions, const EcbsOptions& options, Budget& budget);
+    Status finish(FoundBy author, std::int64_t cost);
     Journey journey(int robot, int earliest) const;
     void expand(int id, Budget& budget);
     void load(int id);
@@ -100,7 +113,7 @@ private:
     OpenList open_;
     SpaceTimeSearch search_;
     std::unique_ptr<HardCases> hard_;  // made for the first hard case
-    Author author_ = Author::focal;  // of the solution
+    FoundBy found_by_ = FoundBy::ecbs;
     bool proves_ = false;  // whether the proving search is of this problem
     Traffic traffic_;
     std::vector<int> loaded_;  // the path of each robot that is in the traffic now

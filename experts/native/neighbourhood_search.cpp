@@ -125,9 +125,15 @@ void NeighbourhoodSearch::replan(Budget& budget) {
         take_out(robot);
         old_plan_[robot] = plan_[robot];
     }
+    std::int64_t least = cost_;  // what the result costs at least, while the rest of the robots take the shortest ways
+    for (const int robot : chosen_) least += distance(robot);
     std::size_t planned = 0;
     for (; planned < chosen_.size(); ++planned) {
-        if (!plan(chosen_[planned], mending ? forever : 0, budget)) break;
+        const int robot = chosen_[planned];
+        least -= distance(robot);
+        const auto latest = mending ? forever : static_cast<int>(std::min<std::int64_t>(cost_before - least, forever));
+        if (!plan(robot, mending ? forever : 0, latest, budget)) break;
+        least += arrival(robot);
         insert(chosen_[planned]);
         if (mending ? meeting_pairs_ > pairs_before : cost_ > cost_before) {
             ++planned;
@@ -143,9 +149,9 @@ void NeighbourhoodSearch::replan(Budget& budget) {
     }
 }
 
-bool NeighbourhoodSearch::plan(int robot, int tolerance, Budget& budget) {
+bool NeighbourhoodSearch::plan(int robot, int tolerance, int latest, Budget& budget) {
     if (!search_.run(problem_->grid, reservations_, problem_->starts[robot], problem_->goals[robot],
-                     problem_->distances.to_goal_of(robot), tolerance, budget))
+                     problem_->distances.to_goal_of(robot), tolerance, latest, budget))
         return false;
     plan_[robot] = search_.actions();
     return true;
@@ -172,10 +178,6 @@ void NeighbourhoodSearch::take_out(int robot) {
     partners_[robot].clear();
     reservations_.remove(robot, view(robot));
     cost_ -= arrival(robot);
-}
-
-int NeighbourhoodSearch::delay(int robot) const {
-    return arrival(robot) - problem_->distances.to_goal_of(robot)[problem_->starts[robot]];
 }
 
 PathView NeighbourhoodSearch::view(int robot) const { return {problem_->starts[robot], plan_[robot]}; }

@@ -48,11 +48,12 @@ private:
     bool choose(int robot);
     void wander(int robot, int time);
     void replan(Budget& budget);
-    bool plan(int robot, int tolerance, Budget& budget);
+    bool plan(int robot, int tolerance, int latest, Budget& budget);
+    int distance(int robot) const { return problem_->distances.to_goal_of(robot)[problem_->starts[robot]]; }
     void insert(int robot);
     void take_out(int robot);
     int arrival(int robot) const { return static_cast<int>(plan_[robot].size()); }
-    int delay(int robot) const;
+    int delay(int robot) const { return arrival(robot) - distance(robot); }
     PathView view(int robot) const;
 
     const Problem* problem_ = nullptr;  // during a search

@@ -22,7 +22,7 @@ Status PrioritisedPlanning::run(const Problem& problem, int max_orders, std::uin
         const auto stuck = std::ranges::find_if(order, [&](int robot) {
             const int start = problem.starts[robot];
             if (!search_.run(problem.grid, reservations_, start, problem.goals[robot],
-                             problem.distances.to_goal_of(static_cast<std::size_t>(robot)), 0, budget))
+                             problem.distances.to_goal_of(static_cast<std::size_t>(robot)), 0, forever, budget))
                 return true;
             plan_[robot] = search_.actions();
             reservations_.add(robot, {start, plan_[robot]});

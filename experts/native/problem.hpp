@@ -16,6 +16,9 @@ namespace mapf {
 // In the order of Python's Status.
 enum class Status : std::uint8_t { solved, node_limit, time_limit, infeasible, step_limit };
 
+// The part of a solver that found its plan, in the order of Python's FoundBy.
+enum class FoundBy : std::uint8_t { none, ecbs, repair, proof, lacam, improvement, prioritised, pibt };
+
 // The highest cost within the factor w, possibly infinite, of a bound.
 inline std::int64_t cost_limit(double w, std::int64_t bound) {
     constexpr auto most = std::int64_t{1} << 62;

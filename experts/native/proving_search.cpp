@@ -57,16 +57,19 @@ ProvingSearch::Outcome ProvingSearch::run(double w, std::int64_t known, std::siz
         return known <= limit || (has_plan() && cost() <= limit);
     };
     while (!open_.empty()) {
+        // Best first: the lowest bound of an open node is a bound on the optimum.
         lower_bound_ = std::max<std::int64_t>(lower_bound_, open_.front().bound);
         if (proved()) return Outcome::proved;
         if (nodes_.size() >= nodes || budget.look()) return Outcome::paused;
         const int id = pop();
         load(id);
         find_conflicts();
-        if (!nodes_[id].weighed && weigh(id, budget)) {
+        // DG heuristic: a node is weighed when it is taken, and goes back where that raises its bound.
+        if (!nodes_[id].has_heuristic && compute_heuristic(id, budget)) {
             push(id);
             continue;
         }
+        // Split: every plan below the node is below one of its children.
         ++expansions_;
         expand(id, budget);
         if (budget.look()) {  // the children may be missing, so the node stays
@@ -126,21 +129,21 @@ void ProvingSearch::find_conflicts() {
             if (occupant == none)
                 occupant = robot;
             else if (time >= tracks_[loaded_[robot]].length)
-                meet(robot, occupant, cells_[robot], time, idle);
+                add_conflict(robot, occupant, cells_[robot], time, idle);
             else
-                meet(occupant, robot, cells_[robot], time, idle);
+                add_conflict(occupant, robot, cells_[robot], time, idle);
         }
         for (int robot = 0; robot < static_cast<int>(num_robots_); ++robot) {
             const int other = previous_occupant_[cells_[robot]];
             if (other <= robot || cells_[other] != previous_cells_[robot]) continue;
-            meet(robot, other, cells_[robot], time, stored(loaded_[robot])[time - 1]);
+            add_conflict(robot, other, cells_[robot], time, stored(loaded_[robot])[time - 1]);
         }
         for (const int cell : previous_cells_) previous_occupant_[cell] = none;
     }
     for (const int cell : cells_) occupant_[cell] = none;
 }
 
-void ProvingSearch::meet(int first, int second, int cell, int time, int action) {
+void ProvingSearch::add_conflict(int first, int second, int cell, int time, int action) {
     for (const auto& known : conflicts_)
         if ((known.first == first && known.second == second) || (known.first == second && known.second == first))
             return;
@@ -149,12 +152,13 @@ void ProvingSearch::meet(int first, int second, int cell, int time, int action) 
 }
 
 // Raises the node's bound by what its dependent pairs cost at least; returns whether it grew.
-bool ProvingSearch::weigh(int id, Budget& budget) {
+bool ProvingSearch::compute_heuristic(int id, Budget& budget) {
     dependent_.clear();
+    // The pairwise dependency graph has an edge for each dependent pair; a vertex cover says who takes longer at least.
     for (const auto& conflict : conflicts_)
         if (depend(conflict.first, conflict.second, budget)) dependent_.emplace_back(conflict.first, conflict.second);
     auto& node = nodes_[id];
-    node.weighed = true;
+    node.has_heuristic = true;
     const int bound = node.cost + cover_.size(dependent_);
     if (bound <= node.bound) return false;
     node.bound = bound;
@@ -166,17 +170,21 @@ void ProvingSearch::expand(int id, Budget& budget) {
     const int first = conflict.first, second = conflict.second;
     const int first_length = tracks_[loaded_[first]].length, second_length = tracks_[loaded_[second]].length;
     std::array<std::array<Constraint, 2>, 2> sides;
-    if (conflict.at_rest) {  // the first arrives later, or the second passes earlier
+    if (conflict.at_rest) {
+        // Target: the first arrives later, or all others are past its goal by then.
         sides[0][0] = {first, {}, conflict.time + 1, forever};
         sides[1][0] = {first, {}, 0, conflict.time};
     } else if (depend(first, second, budget)) {
+        // Dependent pair: the first takes longer, or it does not and the second does.
         sides[0][0] = {first, {}, first_length + 1, forever};
         sides[1][0] = {first, {}, 0, first_length};
         sides[1][1] = {second, {}, second_length + 1, forever};
     } else if (conflict.action == idle) {
+        // Vertex conflict.
         sides[0][0] = {first, {conflict.cell, conflict.time, all_actions}, 0, forever};
         sides[1][0] = {second, {conflict.cell, conflict.time, all_actions}, 0, forever};
     } else {
+        // Swap conflict.
         const int back = problem_->grid.layout.steps()[reversed(conflict.action)];
         sides[0][0] = {first, {conflict.cell, conflict.time, static_cast<std::uint8_t>(1 << conflict.action)}, 0, forever};
         sides[1][0] = {second,
@@ -234,7 +242,7 @@ int ProvingSearch::branch(int id, const std::array<Constraint, 2>& constraints, 
     nodes_.push_back(nodes_[id]);
     auto& node = nodes_.back();
     node.parent = id;
-    node.weighed = false;
+    node.has_heuristic = false;
     node.constraints = constraints;
     node.first_change = changes_.size();
     node.changes = 0;
@@ -312,27 +320,27 @@ const DecisionDiagram& ProvingSearch::diagram(int robot, int basis, const Decisi
     if (&diagrams_[place].diagram == other) place = (place + 1) % diagrams_.size();
     auto& cached = diagrams_[place];
     if (cached.robot == robot && cached.basis == basis) return cached.diagram;
-    collect_rules(robot, basis);
+    collect_constraints(robot, basis);
     builder_.build(problem_->grid, problem_->starts[robot], problem_->goals[robot],
-                   problem_->distances.to_goal_of(static_cast<std::size_t>(robot)), rules_, cached.diagram, budget);
+                   problem_->distances.to_goal_of(static_cast<std::size_t>(robot)), constraints_, cached.diagram, budget);
     cached.robot = budget.look() ? none : robot;
     cached.basis = basis;
     return cached.diagram;
 }
 
-void ProvingSearch::collect_rules(int robot, int basis) {
-    rules_.clear();
+void ProvingSearch::collect_constraints(int robot, int basis) {
+    constraints_.clear();
     for (int at = basis; at != none; at = nodes_[at].parent)
         for (const auto& constraint : nodes_[at].constraints) {
             if (constraint.robot == none) continue;
             if (constraint.robot != robot) {
                 if (constraint.latest != forever)
-                    rules_.closures.push_back({problem_->goals[constraint.robot], constraint.latest});
+                    constraints_.closed_cells.push_back({problem_->goals[constraint.robot], constraint.latest});
                 continue;
             }
-            rules_.earliest = std::max(rules_.earliest, constraint.earliest);
-            rules_.latest = std::min(rules_.latest, constraint.latest);
-            if (constraint.ban.actions != 0) rules_.bans.push_back(constraint.ban);
+            constraints_.earliest = std::max(constraints_.earliest, constraint.earliest);
+            constraints_.latest = std::min(constraints_.latest, constraint.latest);
+            if (constraint.ban.actions != 0) constraints_.bans.push_back(constraint.ban);
         }
 }
 

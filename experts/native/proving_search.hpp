@@ -1,4 +1,6 @@
 // Best-first conflict-based search that reasons about pairs of robots: the proof of optimality, or of a lower bound.
+//
+// Invariant: every plan of the problem obeys the constraints of some open node, and costs at least that node's bound.
 #pragma once
 
 #include <array>
@@ -18,7 +20,7 @@ namespace mapf {
 // Two robots depend on one another if no two of their shortest paths go together (Li, Felner, Boyarski, Ma and Koenig
 // 2019, "Improved heuristics for multi-agent path finding with conflict-based search"). One of the two takes longer
 // then, so a vertex cover of the dependent pairs is a lower bound of what a node's cost has to grow by; and a node is
-// split on who: the first takes longer, or it does not and the second does. That rules out whole rectangles, corridors
+// split on who: the first takes longer, or it does not and the second does. That constraints out whole rectangles, corridors
 // and blocked goals at once, and no plan is looked for on both sides.
 class ProvingSearch {
 public:
@@ -49,7 +51,7 @@ public:
 private:
     struct Constraint {
         int robot = -1;
-        Rules::Ban ban{0, 0, 0};
+        Constraints::Ban ban{0, 0, 0};
         int earliest = 0, latest = forever;
     };
     // A path, and the node whose constraints it was planned under: it is one of the shortest that obey them.
@@ -63,7 +65,7 @@ private:
     };
     struct Node {
         int parent, cost, bound, conflicts;  // bound: no plan below this node costs less
-        bool weighed;                        // whether the bound knows of the dependent pairs
+        bool has_heuristic;                        // whether the bound knows of the dependent pairs
         std::array<Constraint, 2> constraints;
         std::size_t first_change;
         int changes;
@@ -97,8 +99,8 @@ private:
     int pop();
     void load(int id);
     void find_conflicts();
-    void meet(int first, int second, int cell, int time, int action);
-    bool weigh(int id, Budget& budget);
+    void add_conflict(int first, int second, int cell, int time, int action);
+    bool compute_heuristic(int id, Budget& budget);
     void expand(int id, Budget& budget);
     const Conflict& choose(Budget& budget);
     int rank(const Conflict& conflict, Budget& budget);
@@ -108,7 +110,7 @@ private:
     void keep(int id);
     bool depend(int first, int second, Budget& budget);
     const DecisionDiagram& diagram(int robot, int basis, const DecisionDiagram* other, Budget& budget);
-    void collect_rules(int robot, int basis);
+    void collect_constraints(int robot, int basis);
     int store(int robot, int basis, std::span<const std::uint8_t> actions);
     std::span<const std::uint8_t> stored(int track) const;
     PathView view(int track) const;
@@ -129,7 +131,7 @@ private:
     DiagramBuilder builder_;
     JointSearch joint_;
     VertexCover cover_;
-    Rules rules_;
+    Constraints constraints_;
     std::vector<CachedDiagram> diagrams_;
     std::vector<CachedPair> pairs_;
     std::vector<std::uint8_t> new_actions_;

@@ -45,10 +45,11 @@ struct Workspace {
 
 // Reads state `state` into workspace.cells.
 void read_state(const States& states, std::size_t state, const Grid& grid, Workspace& workspace) {
-    workspace.cells.resize(states.num_robots);
+    const auto num_robots = states.num_robots(state);
+    workspace.cells.resize(num_robots);
     workspace.seen_in.resize(std::max(workspace.seen_in.size(), grid.blocked.size()), 0);
-    const std::int32_t* next = states.positions + state * states.num_robots * 2;
-    for (std::size_t robot = 0; robot < states.num_robots; ++robot) {
+    const std::int32_t* next = states.positions + states.offsets[state] * 2;
+    for (std::size_t robot = 0; robot < num_robots; ++robot) {
         const int row = *next++, col = *next++;
         if (!grid.layout.contains(row, col)) reject(state, robot, row, col, "lies outside the map");
         const int cell = grid.layout.cell(row, col);
@@ -81,8 +82,9 @@ void relabel(const std::vector<GoalsOnGrid>& problems, const States& states, con
             read_state(states, state, grid, workspace);
             const Problem problem{grid, workspace.cells, goals, workspace.distances};
             solved[state] = workspace.ecbs.solve(problem, options, budget) == Status::solved;
-            for (std::size_t robot = 0; robot < states.num_robots; ++robot) {
-                std::int8_t& action = actions[state * states.num_robots + robot];
+            std::int8_t* next = actions + states.offsets[state];
+            for (std::size_t robot = 0; robot < states.num_robots(state); ++robot) {
+                std::int8_t& action = *next++;
                 action = idle;
                 if (!solved[state]) continue;
                 const auto path = workspace.ecbs.actions(robot);

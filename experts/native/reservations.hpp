@@ -23,34 +23,40 @@ struct Interval {
 };
 
 class Reservations {
+    // A robot is in a cell at `time`.
+    struct Visit {
+        int time, robot;
+    };
+
+    // The first of a cell's visits that is not before `time`.
+    template <class Visits>
+    static auto from(Visits& visits, int time) {
+        return std::lower_bound(visits.begin(), visits.end(), time,
+                                [](const Visit& visit, int wanted) { return visit.time < wanted; });
+    }
+
 public:
     void reset(const Layout& layout) {
         steps_ = layout.steps();
-        visits_.clear();
-        unused_ = nothing;
-        first_.assign(static_cast<std::size_t>(layout.size()), nothing);
+        for (auto& visits : visits_) visits.clear();
+        visits_.resize(static_cast<std::size_t>(layout.size()));
         rests_.assign(static_cast<std::size_t>(layout.size()), Rest{});
     }
 
     void add(int robot, const PathView& path) {
         follow(path, [&](int cell, int time) {
-            const int id = take_unused();
-            int* place = &first_[cell];
-            while (*place != nothing && visits_[*place].time <= time) place = &visits_[*place].next;
-            visits_[id] = {time, robot, *place};
-            *place = id;
+            auto& visits = visits_[cell];
+            visits.insert(from(visits, time + 1), {time, robot});
         });
         rests_[end_of(path)] = {path.arrival(), robot};
     }
 
     void remove(int robot, const PathView& path) {
         follow(path, [&](int cell, int time) {
-            int* place = &first_[cell];
-            while (visits_[*place].time != time || visits_[*place].robot != robot) place = &visits_[*place].next;
-            const int id = *place;
-            *place = visits_[id].next;
-            visits_[id].next = unused_;
-            unused_ = id;
+            auto& visits = visits_[cell];
+            auto visit = from(visits, time);
+            while (visit->robot != robot) ++visit;
+            visits.erase(visit);
         });
         rests_[end_of(path)] = {};
     }
@@ -61,16 +67,12 @@ public:
     // Calls use(robot) for each robot that is in `cell` at `time` and has not come to rest there before.
     template <class Use>
     void visitors(int cell, int time, const Use& use) const {
-        for (const Visit* visit = first(cell); visit && visit->time <= time; visit = next(*visit))
-            if (visit->time == time) use(visit->robot);
+        const auto& visits = visits_[cell];
+        for (auto visit = from(visits, time); visit != visits.end() && visit->time == time; ++visit) use(visit->robot);
     }
 
     // The last time at which a robot comes to `cell`, -1 if none does.
-    int last_visit(int cell) const {
-        int last = -1;
-        for (const Visit* visit = first(cell); visit; visit = next(*visit)) last = visit->time;
-        return last;
-    }
+    int last_visit(int cell) const { return visits_[cell].empty() ? -1 : visits_[cell].back().time; }
 
     // A robot that moves from `to` into `from` during the step that ends at `time`, or -1.
     int opposing(int from, int to, int time) const {
@@ -81,23 +83,25 @@ public:
         return found;
     }
 
-    // Calls use(interval) for the intervals of `cell` in the order of time that end after `from` and begin by `until`.
+    // Calls use(interval) for the intervals of `cell` in the order of time that end after `time` and begin by `until`. The
+    // first of them may have begun before the `begin` that is given.
     template <class Use>
-    void intervals(int cell, int from, int until, const Use& use) const {
+    void intervals(int cell, int time, int until, const Use& use) const {
         const int rest = rests_[cell].time;
-        const Visit* visit = first(cell);
-        for (int begin = 0; begin <= until;) {
-            const int busy = visit ? std::min(visit->time, rest) : rest;
+        const auto& visits = visits_[cell];
+        auto visit = from(visits, time);
+        for (int begin = time; begin <= until;) {
+            const int busy = visit == visits.end() ? rest : std::min(visit->time, rest);
             if (begin < busy) {
-                if (busy > from) use(Interval{begin, busy, false});
+                use(Interval{begin, busy, false});
                 begin = busy;
                 continue;
             }
             if (begin == forever) return;
             int end = begin;
-            for (; visit && visit->time <= end; visit = next(*visit)) end = visit->time + 1;
+            for (; visit != visits.end() && visit->time <= end; ++visit) end = visit->time + 1;
             if (rest <= end) end = forever;
-            if (end > from) use(Interval{begin, end, true});
+            use(Interval{begin, end, true});
             if (end == forever) return;
             begin = end;
         }
@@ -119,18 +123,11 @@ public:
                 });
             before = cell;
         });
-        for (const Visit* visit = first(before); visit; visit = next(*visit))
-            if (visit->time > path.arrival()) meet(visit->robot);
+        const auto& visits = visits_[before];
+        for (auto visit = from(visits, path.arrival() + 1); visit != visits.end(); ++visit) meet(visit->robot);
     }
 
 private:
-    static constexpr int nothing = -1;
-
-    // A robot is in a cell at `time`.
-    struct Visit {
-        int time = 0, robot = 0, next = nothing;
-    };
-
     template <class Use>
     void follow(const PathView& path, const Use& use) const {
         int cell = path.start, time = 0;
@@ -150,25 +147,9 @@ private:
         return found;
     }
 
-    const Visit* first(int cell) const { return at(first_[cell]); }
-    const Visit* next(const Visit& visit) const { return at(visit.next); }
-    const Visit* at(int id) const { return id == nothing ? nullptr : &visits_[static_cast<std::size_t>(id)]; }
-
-    int take_unused() {
-        if (unused_ == nothing) {
-            visits_.emplace_back();
-            return static_cast<int>(visits_.size()) - 1;
-        }
-        const int id = unused_;
-        unused_ = visits_[id].next;
-        return id;
-    }
-
     std::array<int, num_actions> steps_{};
-    std::vector<Visit> visits_;  // of all cells; the visits of a cell are a list in the order of time
-    std::vector<int> first_;     // of each cell
+    std::vector<std::vector<Visit>> visits_;  // of each cell, in the order of time
     std::vector<Rest> rests_;
-    int unused_ = nothing;  // the first of a list, too
 };
 
 }  // namespace mapf

@@ -5,20 +5,23 @@
 namespace mapf {
 
 bool SafeIntervalSearch::run(const Grid& grid, const Reservations& others, int start, int goal,
-                             const Distance* distance, int tolerance, Budget& budget) {
+                             const Distance* distance, int tolerance, int latest, Budget& budget) {
     others_ = &others;
     distance_ = distance;
     steps_ = grid.layout.steps();
     goal_ = goal;
     earliest_ = others.last_visit(goal) + 1;
     tolerance_ = tolerance;
+    latest_ = latest;
     states_.clear();
     reached_.clear();
     for (auto& heap : open_) heap.clear();
     fewest_ = open_.size();
 
+    // The start state: the interval of the start cell that holds time 0.
     others.intervals(start, 0, 0, [&](const Interval& interval) { reach(-1, start, 0, interval, 0); });
     while (!budget.spent()) {
+        // Pop the state with the fewest meetings, then the lowest f = time + distance.
         const int id = pop();
         if (id < 0) return false;
         const auto state = states_[id];
@@ -26,6 +29,7 @@ bool SafeIntervalSearch::run(const Grid& grid, const Reservations& others, int s
             trace(id);
             return true;
         }
+        // Dominance: a state of the same interval that was expanded from an earlier time covers this one.
         auto& expanded = reached_(state.cell, state.end).expanded;
         if (expanded <= state.time) continue;
         expanded = state.time;
@@ -36,6 +40,7 @@ bool SafeIntervalSearch::run(const Grid& grid, const Reservations& others, int s
 
 void SafeIntervalSearch::expand(int id) {
     const auto state = states_[id];
+    // Goal test: the robot may stay for good, if those who pass later are tolerated.
     if (state.cell == goal_) {
         int later = 0;
         if (state.end != forever)
@@ -48,6 +53,7 @@ void SafeIntervalSearch::expand(int id) {
             push(end);
         }
     }
+    // Successors: every safe interval of a neighbour cell that begins before this interval ends.
     for (int action = 0; action < idle; ++action) {
         const int cell = state.cell + steps_[action];
         if (distance_[cell] == unreachable) continue;
@@ -75,10 +81,11 @@ void SafeIntervalSearch::reach(int parent, int cell, int time, const Interval& i
 }
 
 void SafeIntervalSearch::push(const State& state) {
-    const auto heap = static_cast<std::size_t>(state.meetings);
-    if (heap >= open_.size()) open_.resize(heap + 1);
     const int distance = distance_[state.cell];
     const int length = state.arrived ? state.time : std::max(state.time + distance, earliest_);
+    if (length > latest_) return;
+    const auto heap = static_cast<std::size_t>(state.meetings);
+    if (heap >= open_.size()) open_.resize(heap + 1);
     open_[heap].push_back({length, distance - state.arrived, static_cast<int>(states_.size())});
     std::push_heap(open_[heap].begin(), open_[heap].end(), is_worse);
     states_.push_back(state);

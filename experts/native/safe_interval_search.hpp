@@ -18,10 +18,10 @@ namespace mapf {
 // so waiting costs nothing to search. Paths come in the order of the busy intervals they enter, then of their length.
 class SafeIntervalSearch {
 public:
-    // Whether there is a path that enters at most `tolerance` busy intervals. It is then in actions() until the next
-    // search.
+    // Returns true if there is a path that enters at most `tolerance` busy intervals and arrives by `latest`. It is then
+    // in actions() until the next search.
     bool run(const Grid& grid, const Reservations& others, int start, int goal, const Distance* distance, int tolerance,
-             Budget& budget);
+             int latest, Budget& budget);
 
     const std::vector<std::uint8_t>& actions() const { return actions_; }
 
@@ -54,7 +54,7 @@ private:
     const Reservations* others_ = nullptr;
     const Distance* distance_ = nullptr;
     std::array<int, num_actions> steps_{};
-    int goal_ = 0, earliest_ = 0, tolerance_ = 0;
+    int goal_ = 0, earliest_ = 0, tolerance_ = 0, latest_ = 0;
 
     std::vector<State> states_;
     CellTimeTable<Reached> reached_;       // by cell and end of the interval

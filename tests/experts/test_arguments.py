@@ -13,6 +13,7 @@ from mapf_env import Instance, Solution
 from wrong_arguments import (
     ARRAY,
     COUNT,
+    FLAG,
     INTEGER,
     NUMBER,
     OBJECT,
@@ -49,7 +50,20 @@ CALLS: dict[str, Any] = {
         ONE,
         {"instance": OBJECT, "max_orders": COUNT, "time_limit": LIMITS["time_limit"], "seed": LIMITS["seed"]},
     ),
-    "pibt": (experts.pibt, ONE, {"instance": OBJECT, "max_steps": COUNT, "seed": LIMITS["seed"]}),
+    "pibt": (experts.pibt, ONE, {"instance": OBJECT, "max_steps": COUNT, "seed": LIMITS["seed"], "swap": FLAG}),
+    "label_plans": (
+        experts.label_plans,
+        {"instances": [INSTANCE]},
+        {
+            "instances": (*SEVERAL, INSTANCE),
+            "steps": COUNT,
+            "w": (*FACTOR, float("inf")),
+            "node_limit": LIMITS["node_limit"],
+            "rounds": COUNT,
+            "threads": MANY["threads"],
+            "seed": LIMITS["seed"],
+        },
+    ),
     "solve_many": (experts.solve_many, {"instances": [INSTANCE]}, MANY),
     "solve_stream": (
         lambda **arguments: list(experts.solve_stream(**arguments)),
@@ -95,7 +109,7 @@ def test_wrong_arguments_are_refused_by_name(
 
 def test_every_public_call_is_among_these() -> None:
     found = {name.partition(".")[0] for name in CALLS}
-    assert found | {"Solver", "Status"} == set(experts.__all__)
+    assert found | {"FoundBy", "PlanLabels", "RollingHorizon", "Solver", "Status", "audited"} == set(experts.__all__)
 
 
 def test_a_stream_refuses_its_arguments_before_the_first_result_is_asked_for() -> None:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 import experts
 import plan_oracles
 import strategies
-from experts import Result, Status
-from mapf_env import Instance, random_instance
+from experts import FoundBy, Result, Status
+from mapf_env import Instance, Maze, random_instance
 
 CORRIDOR = Instance(np.zeros((1, 5), bool), [(0, 0), (0, 4)], [(0, 4), (0, 0)])
 FACTORS = st.sampled_from([1.0, 1.05, 1.2, 1.5, 3.0])
@@ -143,8 +143,40 @@ def test_an_unprovable_infeasible_instance_ends_at_a_limit() -> None:
     cells = [(0, 0), (0, 1), (1, 1), (1, 0)]
     instance = Instance(np.zeros((2, 2), bool), cells, [cells[1], cells[0], *cells[2:]])
     assert plan_oracles.optimal_cost(instance.grid, instance.starts, instance.goals) is None
-    assert experts.solve(instance, node_limit=1_000).status is Status.NODE_LIMIT
-    assert experts.solve(instance, time_limit=0.05).status is Status.TIME_LIMIT
+    assert experts.solve(instance, w=1, node_limit=1_000).status is Status.NODE_LIMIT
+    assert experts.solve(instance, w=1, time_limit=0.05).status is Status.TIME_LIMIT
+    assert experts.solve(instance).status is Status.INFEASIBLE, "LaCAM sees all joint states"
+
+
+def test_a_hard_case_asks_the_complete_search() -> None:
+    grid = np.array([[1, 0, 0], [0, 0, 0]], bool)
+    instance = Instance(grid, [(1, 0), (1, 2), (0, 1), (0, 2)], [(1, 0), (1, 1), (1, 2), (0, 2)])
+    assert plan_oracles.optimal_cost(grid, instance.starts, instance.goals) == 28
+    result = experts.solve(instance, w=100)
+    require_solution(instance, result)
+    assert result.found_by in (FoundBy.LACAM, FoundBy.IMPROVEMENT)
+    assert result.cost is not None
+    assert 28 <= result.cost <= 100 * result.lower_bound
+    assert result.seconds < 1
+
+
+@small
+@given(strategies.instances(max_side=5, min_agents=2, max_agents=10), st.sampled_from([1.05, 1.5, 3.0, 20.0]))
+def test_what_lacam_solves_within_the_bound_never_ends_at_the_node_limit(instance: Instance, w: float) -> None:
+    result, lacam = experts.solve(instance, w=w, node_limit=200), experts.lacam(instance, node_limit=200)
+    if not result.solved and lacam.cost is not None:
+        assert lacam.cost > w * result.lower_bound
+    assert (result.found_by is None) == (not result.solved)
+
+
+@pytest.mark.parametrize("num_agents", [32, 64])
+def test_crowds_in_mazes_are_solved_within_twice_the_bound(num_agents: int) -> None:
+    for seed in range(6):
+        crowd = random_instance(height=21, width=21, num_agents=num_agents, style=Maze(loops=0.3), seed=seed)
+        result = experts.solve(crowd, w=2)
+        require_solution(crowd, result)
+        assert result.cost is not None
+        assert result.cost <= 2 * result.lower_bound
 
 
 def test_the_node_limit_bounds_the_nodes() -> None:

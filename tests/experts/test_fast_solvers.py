@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 import experts
 import plan_oracles
 import strategies
-from experts import Status
-from mapf_env import Instance, random_instance
+from experts import FoundBy, Status
+from mapf_env import Instance, Maze, random_instance
 
 seeds = st.integers(0, 2**64 - 1)
 CORRIDOR = Instance(np.zeros((1, 4), bool), [(0, 0), (0, 3)], [(0, 3), (0, 0)])
@@ -57,6 +57,38 @@ def test_lacam_with_many_robots_improves_its_plan() -> None:
     assert first.cost is not None
     assert better.cost is not None
     assert better.cost <= 1.15 * better.lower_bound < first.cost
+
+
+@pytest.mark.parametrize(
+    ("style", "density", "num_agents"),
+    [(Maze(), 0.0, 32), (Maze(), 0.0, 64), (Maze(loops=0.3), 0.0, 64), ("cells", 0.3, 64)],
+)
+def test_lacam_solves_every_crowd(style: Maze | str, density: float, num_agents: int) -> None:
+    for seed in range(8):
+        crowd = random_instance(height=21, width=21, num_agents=num_agents, style=style, density=density, seed=seed)  # pyright: ignore[reportArgumentType]
+        result = experts.lacam(crowd, node_limit=200_000, time_limit=math.inf)
+        require_plan(crowd, result)
+        assert result.found_by is FoundBy.LACAM
+
+
+def test_a_long_plan_is_improved() -> None:
+    crowd = random_instance(height=21, width=21, num_agents=48, style=Maze(), seed=0)
+    first, better = experts.lacam(crowd), experts.lacam(crowd, w=1, time_limit=0.5)
+    require_plan(crowd, first)
+    require_plan(crowd, better)
+    assert better.found_by is FoundBy.IMPROVEMENT
+    assert first.solution is not None
+    assert better.solution is not None
+    assert better.solution.sum_of_costs < 0.9 * first.solution.sum_of_costs
+
+
+def test_the_node_limit_also_bounds_the_tries() -> None:
+    """Robots that fill a corridor have no move but many constraints on one."""
+    full = Instance(np.zeros((1, 12), bool), [(0, col) for col in range(12)], [(0, 11 - col) for col in range(12)])
+    result = experts.lacam(full, node_limit=500, time_limit=math.inf)
+    assert result.status is Status.NODE_LIMIT
+    assert result.generated < 500
+    assert result.expansions == 2_000
 
 
 def test_a_large_map() -> None:

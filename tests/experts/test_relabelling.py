@@ -44,6 +44,16 @@ def test_states_of_many_instances_on_many_threads() -> None:
         np.testing.assert_array_equal(again, actions)
 
 
+def test_states_of_different_team_sizes_and_maps_in_one_call() -> None:
+    instances = [random_instance(height=10 + n % 3, num_agents=n, seed=n) for n in (3, 9, 1, 6)]
+    batch = [instances[i % 4] for i in range(50)]
+    positions = np.concatenate([each.starts for each in batch])
+    offsets = np.cumsum([0, *[each.num_agents for each in batch]])
+    actions, solved = experts.relabel(batch, positions, offsets=offsets, threads=2)
+    assert solved.all()
+    assert actions.tolist() == [move for each in batch for move in first_actions(each)[0]]
+
+
 def test_the_expert_drives_every_team_home() -> None:
     instance = random_instance(num_agents=10, seed=1)
     solution = experts.solve(instance).solution
@@ -95,7 +105,12 @@ def test_bad_shapes_are_named() -> None:
         experts.relabel([OPEN, OPEN], OPEN.starts[None])
     with pytest.raises(TypeError, match="positions must be integers"):
         experts.relabel(OPEN, OPEN.starts[None].astype(float))
-    with pytest.raises(ValueError, match="same number of agents"):
+    with pytest.raises(ValueError, match="state 1 holds 2 agents, but an instance has 3"):
         experts.relabel([OPEN, random_instance(num_agents=3, seed=0)], np.zeros((2, 2, 2), int))
+    for offsets in ([0, 1], [1, 2], [0, 0, 2], [0, 2, 1, 2], [0, 3]):
+        with pytest.raises(ValueError, match="offsets must rise from 0 to the number of robots, 2"):
+            experts.relabel(OPEN, OPEN.starts, offsets=offsets)
+    with pytest.raises(ValueError, match="state 0 holds 1 agents, but an instance has 2"):
+        experts.relabel(OPEN, OPEN.starts, offsets=[0, 1, 2])
     with pytest.raises(ValueError, match="w must be"):
         experts.relabel(OPEN, OPEN.starts[None], w=0.5)

@@ -89,13 +89,13 @@ int main(int count, char** arguments) {
             require(ecbs.cost() <= w * ecbs.lower_bound(), "the bound of ECBS does not hold", crowd);
         }
         mapf::Lacam lacam(grid, starts, goals, seed);
-        if (lacam.run(300, budget) == mapf::Status::solved) {
+        if (lacam.run(mapf::Lacam::limits_of(300), budget) == mapf::Status::solved) {
             const auto plan = lacam.plan();
             require(is_plan(crowd, [&](std::size_t robot) { return plan.actions(robot); }), "no plan by LaCAM", crowd);
         }
         if (planning.run(problem, 5, seed, budget) == mapf::Status::solved)
             require(is_plan(crowd, [&](std::size_t robot) { return planning.actions(robot); }), "no plan", crowd);
-        mapf::run_pibt(problem, 50, seed, budget);
+        mapf::run_pibt(problem, round % 2 == 0, 50, seed, budget);
     }
     std::printf("%d crowds, %d plans by ECBS\n", rounds, solved);
 }

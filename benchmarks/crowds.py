@@ -1,0 +1,251 @@
+"""Solvers in crowds: `python benchmarks/crowds.py COMMAND`.
+
+`table`: first plans, improved plans and bounded plans of dense cases. `labels`: states labelled a second. `lifelong`:
+goals reached a step by the planner with a rolling horizon. `plot`: success and cost against time. One thread, except
+for `labels`. POGEMA's maps are read from `FOLDER/NAME/maps.yaml`; without the folder its rows are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import experts
+from experts import Result, Solver
+from mapf_env import BatchedEnv, Instance, Maze, Rooms, Warehouse, load_pogema_maps, random_instance
+from solvers import commit, timed
+
+Cases = dict[str, list[Instance]]
+
+LIFELONG_STEPS = 256
+
+
+def main() -> None:
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument("--pogema", type=Path, metavar="FOLDER", help="folder of POGEMA's sets, such as 02-mazes")
+    shared.add_argument("--cases", type=int, help="cases of each row (default: 32 of POGEMA's, 16 of our own)")
+    shared.add_argument("--time-limit", type=float, default=2.0, help="seconds for each case (default: 2)")
+    shared.add_argument("--rows", nargs="+", help="rows whose names begin with one of these words (default: all)")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for run in (table, labels, lifelong, plot):
+        summary = (run.__doc__ or "").splitlines()[0]
+        command = commands.add_parser(run.__name__, help=summary, description=summary, parents=[shared])
+        command.set_defaults(run=run)
+        if run is labels:
+            command.add_argument("--threads", type=int, default=2, help="default: 2")
+        if run is lifelong:
+            command.add_argument("--rounds", type=int, nargs="+", default=[200], help="default: 200")
+            command.add_argument("--window", type=int, default=10, help="default: 10")
+        if run is plot:
+            command.add_argument("--out", type=Path, default=Path("docs/crowds.png"), help="default: docs/crowds.png")
+    options = parser.parse_args()
+    console = Console(width=140)
+    console.print(f"commit {commit()}")
+    options.run(options, console)
+
+
+def table(options: argparse.Namespace, console: Console) -> None:
+    """First plans, improved plans and plans within a bound of dense cases."""
+    limit = options.time_limit
+    solvers: dict[str, Solver] = {
+        "lacam, first": partial(experts.lacam, time_limit=limit),
+        f"lacam, w=1, {limit:g} s": partial(experts.lacam, w=1, time_limit=limit),
+        "solve, w=1.5": partial(experts.solve, w=1.5, time_limit=limit),
+        "solve, w=2": partial(experts.solve, w=2, time_limit=limit),
+        "pibt, swap": partial(experts.pibt, swap=True),
+    }
+    columns = ("case", "solver", "solved", "median ms", "max ms", "cost", "cost / bound")
+    printed = Table(*columns, title=f"crowds, {limit:g} s")
+    for name, instances in chosen(options, dense_cases(options.pogema, options.cases)).items():
+        for solver_name, solver in solvers.items():
+            printed.add_row(name, solver_name, *summary(*timed(solver, instances)))
+    console.print(printed)
+
+
+def labels(options: argparse.Namespace, console: Console) -> None:
+    """Robot states that `label_plans` labels in a second, and what the plans cost."""
+    printed = Table("case", "rounds", "solved", "team states / s", "robot states / s", "cost", "/ lacam, 100 ms")
+    for name, instances in chosen(options, dense_cases(options.pogema, options.cases)).items():
+        results, _ = timed(partial(experts.lacam, w=1, time_limit=0.1), instances)
+        reference = np.mean([result.cost for result in results if result.cost is not None])
+        for rounds in (100, 300, 500, 1_000):
+            begin = time.perf_counter()
+            found = experts.label_plans(instances, rounds=rounds, threads=options.threads)
+            seconds = time.perf_counter() - begin
+            cost = found.costs[found.solved].mean()
+            rates = (f"{len(found.source) / seconds:,.0f}", f"{len(found.actions) / seconds:,.0f}")
+            solved = f"{found.solved.mean():.3f}"
+            printed.add_row(name, str(rounds), solved, *rates, f"{cost:.1f}", f"{cost / reference:.3f}")
+    console.print(printed)
+
+
+def lifelong(options: argparse.Namespace, console: Console) -> None:
+    """Goals reached a step in 256 steps on POGEMA's maps, goals drawn by our environment."""
+    sizes = {"01-random": (32, 64), "02-mazes": (32, 64), "03-warehouse": (128, 160, 192), "04-movingai": (256,)}
+    if options.pogema is None:
+        raise SystemExit("lifelong needs POGEMA's maps: give --pogema FOLDER")
+    printed = Table("set", "robots", "planner", "throughput", "ms a step")
+    for name, counts in sizes.items():
+        for num_agents in counts:
+            case = f"{name} {num_agents}"
+            few = options.cases or (16 if num_agents <= 64 else 4)
+            for _, instances in chosen(options, {case: pogema_cases(options.pogema, name, num_agents, few)}).items():
+                for rounds in options.rounds:
+                    make = partial(experts.RollingHorizon, window=options.window, rounds=rounds)
+                    reached, milliseconds = zip(*(play_lifelong(make, each) for each in instances), strict=True)
+                    figures = (f"{np.mean(reached):.3f}", f"{np.mean(milliseconds):.2f}")
+                    printed.add_row(name, str(num_agents), f"{rounds} rounds", *figures)
+    console.print(printed)
+
+
+def play_lifelong(make: Callable[..., experts.RollingHorizon], instance: Instance) -> tuple[float, float]:
+    """Goals reached a step, and milliseconds of planning a step."""
+    height, width = instance.grid.shape
+    env = BatchedEnv(
+        1,
+        num_agents=instance.num_agents,
+        height=height,
+        width=width,
+        density=0,
+        style="empty",
+        task="lifelong",
+        max_cycles=LIFELONG_STEPS,
+    )
+    env.reset(0, instances=[instance], observe=False)
+    planner, reached, seconds = make(instance.grid), 0, 0.0
+    for _ in range(LIFELONG_STEPS):
+        begin = time.perf_counter()
+        actions = planner.act(env.positions[0], env.goals[0])
+        seconds += time.perf_counter() - begin
+        reached += int(env.step(actions[None], observe=False).arrived.sum())
+    return reached / LIFELONG_STEPS, seconds * 1e3 / LIFELONG_STEPS
+
+
+def plot(options: argparse.Namespace, console: Console) -> None:
+    """Draw success and cost against time for each kind of map and 16 to 1,000 robots."""
+    import matplotlib.pyplot as plt
+
+    cases = options.cases or 4
+    families: dict[str, tuple[tuple[int, ...], Callable[[int, int], Instance]]] = {
+        "random, 64x64, 20 %": ((16, 64, 256, 1000), on_random_maps),
+        "maze, 41x41": ((16, 64, 128, 256), on_mazes),
+        "rooms, 64x64": ((16, 64, 256, 1000), on_rooms),
+        "warehouse, 60x100": ((16, 64, 256, 1000), on_warehouses),
+    }
+    if options.pogema is not None:
+        cities = list(load_pogema_maps(options.pogema / "04-movingai" / "maps.yaml").values())
+        families["city, 64x64"] = ((16, 64, 256, 1000), lambda n, seed: cities[seed].instance(n, seed))
+    solvers: dict[str, Solver] = {
+        "pibt, swap": partial(experts.pibt, swap=True),
+        "prioritised": partial(experts.prioritised, time_limit=options.time_limit),
+        "lacam": partial(experts.lacam, time_limit=options.time_limit),
+        f"lacam, w=1, {options.time_limit:g} s": partial(experts.lacam, w=1, time_limit=options.time_limit),
+        "solve, w=1.2": partial(experts.solve, w=1.2, time_limit=options.time_limit),
+        "solve, w=2": partial(experts.solve, w=2, time_limit=options.time_limit),
+    }
+    figure, axes = plt.subplots(len(families), 4, figsize=(13, 2.7 * len(families)), sharex=True, squeeze=False)
+    printed = Table("maps", "robots", "solver", "solved", "median ms", "max ms", "cost", "cost / bound")
+    for row, (family, (sizes, make)) in enumerate(families.items()):
+        for col, num_agents in enumerate(sizes):
+            axis = axes[row][col]
+            instances = [make(num_agents, seed) for seed in range(cases)]
+            for marker, (name, solver) in zip("sv^o*P", solvers.items(), strict=True):
+                results, milliseconds = timed(solver, instances)
+                printed.add_row(family, str(num_agents), name, *summary(results, milliseconds))
+                solved = [result for result in results if result.cost is not None]
+                if not solved:
+                    axis.plot([], [], marker, label=f"{name}: none")
+                    continue
+                ratio = sum(result.cost or 0 for result in solved) / sum(lower_bound(each) for each in solved)
+                share = "" if len(solved) == len(results) else f" ({len(solved) / len(results):.0%})"
+                axis.plot(np.median(milliseconds), ratio, marker, label=name + share, alpha=len(solved) / len(results))
+            axis.set(
+                xscale="log", title=f"{family}, {num_agents} robots", ylabel="cost / distances" if col == 0 else ""
+            )
+            axis.title.set_fontsize(8)
+            axis.legend(fontsize=5)
+    for axis in axes[-1]:
+        axis.set_xlabel("median ms")
+    figure.tight_layout()
+    figure.savefig(options.out, dpi=110)
+    console.print(printed)
+    console.print(f"wrote {options.out}")
+
+
+def lower_bound(result: Result) -> int:
+    """The bound that costs are compared with, at least 1."""
+    return max(result.lower_bound, 1)
+
+
+def on_random_maps(num_agents: int, seed: int) -> Instance:
+    return random_instance(height=64, width=64, density=0.2, num_agents=num_agents, seed=seed)
+
+
+def on_mazes(num_agents: int, seed: int) -> Instance:
+    return random_instance(height=41, width=41, style=Maze(loops=0.3), num_agents=num_agents, seed=seed)
+
+
+def on_rooms(num_agents: int, seed: int) -> Instance:
+    return random_instance(height=64, width=64, style=Rooms(), num_agents=num_agents, seed=seed)
+
+
+def on_warehouses(num_agents: int, seed: int) -> Instance:
+    return random_instance(height=60, width=100, style=Warehouse(), num_agents=num_agents, seed=seed)
+
+
+def dense_cases(pogema: Path | None, cases: int | None) -> Cases:
+    """The dense cases: the first of POGEMA's, and our own with seeds from 0."""
+    found: Cases = {}
+    if pogema is not None:
+        for name, num_agents in (("02-mazes", 32), ("02-mazes", 64), ("01-random", 64)):
+            found[f"{name} {num_agents}"] = pogema_cases(pogema, name, num_agents, cases or 32)
+    seeds = range(cases or 16)
+    for name, style, num_agents in (
+        ("Maze() 32", Maze(), 32),
+        ("Maze() 64", Maze(), 64),
+        ("Maze(loops=.3) 64", Maze(loops=0.3), 64),
+    ):
+        found[name] = [
+            random_instance(height=21, width=21, style=style, num_agents=num_agents, seed=seed) for seed in seeds
+        ]
+    found["cells 64"] = [random_instance(density=0.3, num_agents=64, seed=seed) for seed in seeds]
+    return found
+
+
+def pogema_cases(folder: Path, name: str, num_agents: int, cases: int) -> list[Instance]:
+    """The first instances of a set; a set of one map has a seed for each instance, the others a map."""
+    maps = list(load_pogema_maps(folder / name / "maps.yaml").values())
+    if len(maps) == 1:
+        return [maps[0].instance(num_agents, seed) for seed in range(cases)]
+    return [each.instance(num_agents, 0) for each in islice(maps, cases)]
+
+
+def chosen(options: argparse.Namespace, cases: Cases) -> Cases:
+    """The rows that were asked for."""
+    words = options.rows
+    return {name: each for name, each in cases.items() if words is None or any(name.startswith(w) for w in words)}
+
+
+def summary(results: list[Result], milliseconds: list[float]) -> tuple[str, ...]:
+    """Share solved, median and greatest time, mean cost and cost over bound of the solved cases."""
+    costs = [result.cost for result in results if result.cost is not None]
+    bounds = [lower_bound(result) for result in results if result.solved]
+    times = (f"{np.median(milliseconds):.2f}", f"{max(milliseconds):.1f}")
+    share = f"{len(costs) / len(results):.3f}"
+    if not costs:
+        return (share, *times, "", "")
+    return (share, *times, f"{np.mean(costs):.1f}", f"{sum(costs) / math.fsum(bounds):.3f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""A planner for lifelong play: plans all robots a few steps ahead, and again after each step."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from experts import _native, arguments
+from mapf_env.instance import as_obstacles
+
+
+class RollingHorizon:
+    """Plans joint moves for teams whose goals change while they move, as in the lifelong task.
+
+    Rolling-horizon collision resolution (Li et al. 2021, "Lifelong multi-agent path finding in large-scale
+    warehouses"): plans have `window` steps without a conflict, and after `execute` of them the robots plan again. PIBT
+    with swap makes a first plan of each window, so there always is one; large neighbourhood search improves it (Jiang
+    et al. 2024, "Scaling lifelong multi-agent path finding to more realistic settings"). No clock decides, so equal
+    calls give equal moves.
+
+    Args:
+        grid: The map (H, W), True on obstacles. Distances to goals are kept, two bytes for each cell and goal.
+        window: Steps to plan ahead.
+        execute: Steps to execute of each plan, at most `window`; 1 plans before every step.
+        rounds: Rounds of the neighbourhood search on each plan; more rounds bring more goals a step and take longer.
+        seed: Draws ties and neighbourhoods.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+        TypeError: If an argument has the wrong type.
+    """
+
+    def __init__(
+        self,
+        grid: npt.ArrayLike,
+        *,
+        window: int = arguments.DEFAULT_WINDOW,
+        execute: int = 1,
+        rounds: int = arguments.DEFAULT_WINDOW_ROUNDS,
+        seed: int = 0,
+    ) -> None:
+        window = arguments.at_least_one(window, "window", maximum=arguments.MAX_WINDOW)
+        rounds = arguments.at_least_one(rounds, "rounds", maximum=arguments.MAX_ROUNDS)
+        self._execute = arguments.at_least_one(execute, "execute", maximum=window)
+        self._native = _native.RollingHorizon(as_obstacles(grid), window, rounds, arguments.seed(seed))
+        self._plan = np.zeros((0, 0), np.int8)
+        self._expected = np.zeros((0, 2), np.int32)
+        self._time = 0
+
+    def act(self, positions: npt.ArrayLike, goals: npt.ArrayLike) -> npt.NDArray[np.int8]:
+        """Return the next joint action.
+
+        Robots that are elsewhere than the last plan left them, a new episode among them, are planned from where they
+        are.
+
+        Args:
+            positions: (N, 2) integers, the row and column of each robot.
+            goals: (N, 2) integers, where each robot has to go now.
+
+        Returns:
+            (N,) int8, the `Action` of each robot. Together they have no conflict.
+
+        Raises:
+            ValueError: If shapes do not fit, or a robot or its goal is off the map, on an obstacle or out of reach.
+            TypeError: If an array does not hold integers.
+            KeyboardInterrupt: At Ctrl-C.
+        """
+        here = arguments.cells(positions, "positions", "(N, 2)")
+        there = arguments.cells(goals, "goals", "(N, 2)")
+        if len(there) != len(here) or len(here) == 0:
+            raise ValueError(f"give a goal for each robot and at least one: {len(here)} positions, {len(there)} goals")
+        follows = np.array_equal(here, self._expected)
+        if not follows or self._time == self._execute:
+            self._plan = self._native.plan(here, there, self._time if follows else 0)
+            self._time = 0
+        actions = self._plan[self._time]
+        self._expected = here + _STEPS[actions]
+        self._time += 1
+        return actions
+
+
+_STEPS = np.array([(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)], np.int32)
