@@ -1,8 +1,8 @@
 """Solvers in crowds: `python benchmarks/crowds.py COMMAND`.
 
-`table`: first plans, improved plans and bounded plans of dense cases. `labels`: states labelled a second. `lifelong`:
-goals reached a step by the planner with a rolling horizon. `plot`: success and cost against time. One thread, except
-for `labels`. POGEMA's maps are read from `FOLDER/NAME/maps.yaml`; without the folder its rows are left out.
+`table`: first plans, improved plans and bounded plans of dense cases. `labels`: states labelled a second. `plot`:
+success and cost against time. One thread, except for `labels`. POGEMA's maps are read from `FOLDER/NAME/maps.yaml`;
+without the folder its rows are left out. For lifelong play, see `pogema.py --lifelong --methods rolling`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,10 @@ from rich.table import Table
 
 import experts
 from experts import Result, Solver
-from mapf_env import BatchedEnv, Instance, Maze, Rooms, Warehouse, load_pogema_maps, random_instance
+from mapf_env import Instance, Maze, Rooms, Warehouse, load_pogema_maps, random_instance
 from solvers import commit, timed
 
 Cases = dict[str, list[Instance]]
-
-LIFELONG_STEPS = 256
 
 
 def main() -> None:
@@ -37,15 +35,12 @@ def main() -> None:
     shared.add_argument("--rows", nargs="+", help="rows whose names begin with one of these words (default: all)")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for run in (table, labels, lifelong, plot):
+    for run in (table, labels, plot):
         summary = (run.__doc__ or "").splitlines()[0]
         command = commands.add_parser(run.__name__, help=summary, description=summary, parents=[shared])
         command.set_defaults(run=run)
         if run is labels:
             command.add_argument("--threads", type=int, default=2, help="default: 2")
-        if run is lifelong:
-            command.add_argument("--rounds", type=int, nargs="+", default=[200], help="default: 200")
-            command.add_argument("--window", type=int, default=10, help="default: 10")
         if run is plot:
             command.add_argument("--out", type=Path, default=Path("docs/crowds.png"), help="default: docs/crowds.png")
     options = parser.parse_args()
@@ -87,48 +82,6 @@ def labels(options: argparse.Namespace, console: Console) -> None:
             solved = f"{found.solved.mean():.3f}"
             printed.add_row(name, str(rounds), solved, *rates, f"{cost:.1f}", f"{cost / reference:.3f}")
     console.print(printed)
-
-
-def lifelong(options: argparse.Namespace, console: Console) -> None:
-    """Goals reached a step in 256 steps on POGEMA's maps, goals drawn by our environment."""
-    sizes = {"01-random": (32, 64), "02-mazes": (32, 64), "03-warehouse": (128, 160, 192), "04-movingai": (256,)}
-    if options.pogema is None:
-        raise SystemExit("lifelong needs POGEMA's maps: give --pogema FOLDER")
-    printed = Table("set", "robots", "planner", "throughput", "ms a step")
-    for name, counts in sizes.items():
-        for num_agents in counts:
-            case = f"{name} {num_agents}"
-            few = options.cases or (16 if num_agents <= 64 else 4)
-            for _, instances in chosen(options, {case: pogema_cases(options.pogema, name, num_agents, few)}).items():
-                for rounds in options.rounds:
-                    make = partial(experts.RollingHorizon, window=options.window, rounds=rounds)
-                    reached, milliseconds = zip(*(play_lifelong(make, each) for each in instances), strict=True)
-                    figures = (f"{np.mean(reached):.3f}", f"{np.mean(milliseconds):.2f}")
-                    printed.add_row(name, str(num_agents), f"{rounds} rounds", *figures)
-    console.print(printed)
-
-
-def play_lifelong(make: Callable[..., experts.RollingHorizon], instance: Instance) -> tuple[float, float]:
-    """Goals reached a step, and milliseconds of planning a step."""
-    height, width = instance.grid.shape
-    env = BatchedEnv(
-        1,
-        num_agents=instance.num_agents,
-        height=height,
-        width=width,
-        density=0,
-        style="empty",
-        task="lifelong",
-        max_cycles=LIFELONG_STEPS,
-    )
-    env.reset(0, instances=[instance], observe=False)
-    planner, reached, seconds = make(instance.grid), 0, 0.0
-    for _ in range(LIFELONG_STEPS):
-        begin = time.perf_counter()
-        actions = planner.act(env.positions[0], env.goals[0])
-        seconds += time.perf_counter() - begin
-        reached += int(env.step(actions[None], observe=False).arrived.sum())
-    return reached / LIFELONG_STEPS, seconds * 1e3 / LIFELONG_STEPS
 
 
 def plot(options: argparse.Namespace, console: Console) -> None:

@@ -59,9 +59,10 @@ class Options:
     lifelong: bool = False
     """Measure the throughput over 256 steps instead: a robot on its goal gets the next of those that POGEMA draws."""
     methods: tuple[str, ...] = ("pibt", "n12-informed")
-    """What to play: "pibt"; "greedy"; "lacam", its first plan within two seconds, or "lacam,SECONDS", its plan improved
-    for that long; a policy by its name, file or run folder, or with a row of gnn_policy.evaluate, as in
-    "n12-informed,argmax" (stuck robots draw if no row is given, under the shield of the policy's training)."""
+    """What to play: "pibt"; "pibt_swap"; "greedy"; "lacam", its first plan within two seconds, or "lacam,SECONDS", its
+    plan improved for that long; "rolling", plans of a few steps, or "rolling,ROUNDS", improved for so many rounds; a
+    policy by its name, file or run folder, or with a row of gnn_policy.evaluate, as in "n12-informed,argmax" (stuck
+    robots draw if no row is given, under the shield of the policy's training)."""
     cases: int | None = None
     """Cases to play of each set and team size, spread evenly over all; all of them if not given."""
     published: tuple[str, ...] = ()

@@ -1,6 +1,7 @@
 """What can be played on POGEMA's instances: policies, PIBT, greedy robots and LaCAM, each by name.
 
-A method is written as its name and options with commas between them: "pibt", "lacam,2", "n12-informed,argmax".
+A method is written as its name and options with commas between them: "pibt", "lacam,2", "rolling,200",
+"n12-informed,argmax".
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy.typing as npt
 import torch
 
 import experts
+from experts import arguments
 from gnn_policy import DecentralizedPolicy, Execution, Rollouts, checkpoint, rollout
 from gnn_policy.execution import STUCK_MEMORY, hears_of, is_stuck, robot_seeds
 from mapf_env import MOVES, BatchedEnv, Instance, Observation, instance_hash
@@ -71,13 +73,15 @@ def method_named(words: str) -> Method:
         return _closest_cells(name)
     if name == "lacam":
         return _lacam(words, options)
+    if name == "rolling":
+        return _rolling(words, options)
     if name in SHIELDS:
         raise ValueError(f"{name} has no options, got {words!r}")
     return _policy(name or words, options)
 
 
-SHIELDS = {"greedy": "idle", "pibt": "pibt"}
-"""Robots that always want a cell closest to their goal: greedy ones, and those of PIBT (Okumura et al. 2022)."""
+SHIELDS = {"greedy": "idle", "pibt": "pibt", "pibt_swap": "pibt_swap"}
+"""Robots that always want a cell closest to their goal: greedy ones, and those of PIBT (Okumura et al. 2022, 2023)."""
 
 
 def _closest_cells(name: str) -> Method:
@@ -220,6 +224,31 @@ def _lacam(words: str, options: str) -> Method:
         return judge(instances, plans, max_steps)
 
     return Method(words, {"w": str(w), "time_limit": seconds}, play, None)
+
+
+def _rolling(words: str, options: str) -> Method:
+    """Play with a rolling horizon; the option is the number of rounds for each plan."""
+    if options and not options.isdecimal():
+        raise ValueError(f"the option of rolling is a number of rounds, got {words!r}")
+    rounds = int(options) if options else arguments.DEFAULT_WINDOW_ROUNDS
+    settings = {"fov_radius": 1, "shield": "idle"}
+
+    def choose_by(instance: Instance, seed: int) -> Choose:
+        planner = experts.RollingHorizon(instance.grid, rounds=rounds, seed=_seeds(instance, seed)[1])
+
+        def choose(venv: BatchedEnv, observation: Observation) -> npt.NDArray[np.float32]:
+            return np.eye(len(MOVES), dtype=np.float32)[planner.act(venv.positions[0], venv.goals[0])][None]
+
+        return choose
+
+    def play(instances: Sequence[Instance], max_steps: int, seed: int) -> Played:
+        trips = [drive(each, choose_by(each, seed), settings, max_steps, seed) for each in instances]
+        return judge(instances, [trip.paths for trip in trips], max_steps)
+
+    def serve(instance: Instance, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
+        return drive(instance, choose_by(instance, seed), settings, steps, seed, goals).arrivals
+
+    return Method(words, {"rounds": rounds, "window": arguments.DEFAULT_WINDOW}, play, serve)
 
 
 def judge(instances: Sequence[Instance], paths: Sequence[npt.NDArray[np.integer]], max_steps: int) -> Played:

@@ -121,13 +121,14 @@ Status Ecbs::solve_hard_case(int id, const EcbsOptions& options, Budget& budget)
             if (const auto ended = ask_lacam(more, options, budget)) return *ended;
             if (neighbourhoods.feasible()) known = neighbourhoods.cost();
         }
-        // Proof: the bound rises.
+        // Proof: the bound rises. The larger w is, the less that helps.
         if (!proves_) {
             load(0);
             proving.begin(*problem_, path_of);
             proves_ = true;
         }
-        const auto turn = needs_optimum ? nodes_left() : std::min(nodes_left(), static_cast<std::size_t>(effort));
+        const auto share = static_cast<std::size_t>(effort / std::min(1 + 4 * (options.w - 1), 16.0)) + 1;
+        const auto turn = needs_optimum ? nodes_left() : std::min(nodes_left(), share);
         const auto outcome = proving.run(options.w, known, proving.generated() + turn, budget);
         lower_bound_ = std::max(lower_bound_, static_cast<int>(proving.lower_bound()));
         if (outcome == ProvingSearch::Outcome::infeasible) return Status::infeasible;

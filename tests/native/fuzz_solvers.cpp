@@ -4,12 +4,15 @@
 #include <cstdlib>
 #include <limits>
 #include <numeric>
+#include <utility>
 #include <vector>
 
 #include "experts/native/ecbs.hpp"
+#include "experts/native/labels.hpp"
 #include "experts/native/lacam.hpp"
 #include "experts/native/pibt.hpp"
 #include "experts/native/prioritised.hpp"
+#include "experts/native/rolling_horizon.hpp"
 #include "mapf_env/native/random.hpp"
 
 namespace {
@@ -65,6 +68,44 @@ bool is_plan(const Crowd& crowd, const ActionsOf& actions_of) {
     return cells == crowd.goals;
 }
 
+// True if no joint move of the first steps leaves the map or has a conflict.
+template <class ActionOf>
+bool is_legal(const Crowd& crowd, const ActionOf& action_of, std::size_t num_steps) {
+    auto cells = crowd.starts;
+    const auto steps = crowd.grid.layout.steps();
+    for (std::size_t time = 0; time < num_steps; ++time) {
+        const auto before = cells;
+        for (std::size_t robot = 0; robot < cells.size(); ++robot) {
+            cells[robot] += steps[action_of(time, robot)];
+            if (crowd.grid.blocked[cells[robot]]) return false;
+        }
+        for (std::size_t i = 0; i < cells.size(); ++i)
+            for (std::size_t j = 0; j < i; ++j)
+                if (cells[i] == cells[j] || (cells[i] == before[j] && cells[j] == before[i])) return false;
+    }
+    return true;
+}
+
+// Robots that arrive turn round; every window has to be legal.
+void play_with_rolling_horizon(Crowd crowd, std::uint64_t seed, mapf::Budget& budget) {
+    const int window = 1 + static_cast<int>(seed % 9);
+    const int executed = 1 + static_cast<int>(seed % static_cast<std::uint64_t>(window));
+    mapf::RollingHorizon planner(crowd.grid, window, 10, seed);
+    auto homes = crowd.starts;
+    for (int turn = 0; turn < 4; ++turn) {
+        planner.plan(crowd.starts, crowd.goals, turn == 0 ? 0 : executed, budget);
+        const auto action_of = [&](std::size_t time, std::size_t robot) {
+            return planner.action(robot, static_cast<int>(time));
+        };
+        require(is_legal(crowd, action_of, static_cast<std::size_t>(window)), "a window has a conflict", crowd);
+        for (int time = 0; time < executed; ++time)
+            for (std::size_t robot = 0; robot < homes.size(); ++robot)
+                crowd.starts[robot] += crowd.grid.layout.steps()[planner.action(robot, time)];
+        for (std::size_t robot = 0; robot < homes.size(); ++robot)
+            if (crowd.starts[robot] == crowd.goals[robot]) std::swap(crowd.goals[robot], homes[robot]);
+    }
+}
+
 }  // namespace
 
 int main(int count, char** arguments) {
@@ -73,6 +114,7 @@ int main(int count, char** arguments) {
     mapf::Ecbs ecbs;
     mapf::PrioritisedPlanning planning;
     mapf::DistanceTables distances;
+    std::vector<mapf::Team> teams;
     int solved = 0;
     for (int round = 0; round < rounds; ++round) {
         const auto crowd = draw(random);
@@ -95,7 +137,21 @@ int main(int count, char** arguments) {
         }
         if (planning.run(problem, 5, seed, budget) == mapf::Status::solved)
             require(is_plan(crowd, [&](std::size_t robot) { return planning.actions(robot); }), "no plan", crowd);
-        mapf::run_pibt(problem, round % 2 == 0, 50, seed, budget);
+        const auto run = mapf::run_pibt(problem, round % 2 == 0, 50, seed, budget);
+        require(is_legal(crowd, [&](std::size_t time, std::size_t robot) { return run.actions[time * starts.size() + robot]; },
+                         run.actions.size() / starts.size()),
+                "PIBT makes an illegal move", crowd);
+        play_with_rolling_horizon(crowd, seed, budget);
+        teams.push_back({grid, starts, goals});
+    }
+    mapf::Interrupt interrupt([] { return false; });
+    const auto labels = mapf::label_plans(teams, {20, 1.2, 300, 20, 0}, 2, interrupt);
+    for (std::size_t i = 0; i < teams.size(); ++i) {
+        const Crowd crowd{teams[i].grid, teams[i].starts, teams[i].goals};
+        const auto action_of = [&](std::size_t time, std::size_t robot) {
+            return labels[i].actions[time * crowd.starts.size() + robot];
+        };
+        require(is_legal(crowd, action_of, static_cast<std::size_t>(labels[i].steps)), "labels conflict", crowd);
     }
     std::printf("%d crowds, %d plans by ECBS\n", rounds, solved);
 }
