@@ -80,6 +80,20 @@ std::string cell_text(const std::int32_t* cell) {
     return "(" + std::to_string(cell[0]) + ", " + std::to_string(cell[1]) + ")";
 }
 
+// Throws what is wrong with a robot of team t: its cell, its goal, or that another robot stands on its cell.
+template <class T>
+[[noreturn]] void fail_at(const Layout& layout, const T* obstacles, const std::int32_t* positions,
+                          const std::int32_t* goals, std::size_t robot, std::size_t t) {
+    const std::string name = "robot " + std::to_string(robot) + " of team " + std::to_string(t);
+    for (const std::int32_t* cells : {positions, goals}) {
+        const std::int32_t* cell = cells + 2 * robot;
+        const std::string text = (cells == goals ? "the goal of " : "") + name + " at " + cell_text(cell);
+        if (!layout.contains(cell[0], cell[1])) fail(text + " lies outside the map");
+        if (obstacles[layout.cell(cell[0], cell[1])] != T{0}) fail(text + " lies on an obstacle");
+    }
+    fail("two robots of team " + std::to_string(t) + " stand at " + cell_text(positions + 2 * robot));
+}
+
 // Throws where a state does not fit to its map; all kernels rely on it.
 template <class T>
 void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& senses) {
@@ -121,25 +135,21 @@ void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& 
                         static_cast<std::int64_t>(maps.cells.size()),
                 "the maps do not fit into their memory");
         const T* obstacles = maps.obstacles(states.maps(t));
-        taken.resize(std::max<std::size_t>(taken.size(), layout.size()), 0);
+        if (taken.size() < static_cast<std::size_t>(layout.size())) taken.resize(layout.size(), 0);
         const std::size_t first = states.offsets(t), n = states.robots(t);
-        for (const auto* cells : {&states.positions, &states.goals}) {
-            const char* what = cells == &states.goals ? "the goal of robot " : "robot ";
-            for (std::size_t i = 0; i < n; ++i) {
-                const std::int32_t* cell = cells->data() + 2 * (first + i);
-                const auto text = [&] { return what + std::to_string(i) + where() + " at " + cell_text(cell); };
-                if (!layout.contains(cell[0], cell[1])) fail(text() + " lies outside the map");
-                if (obstacles[layout.cell(cell[0], cell[1])] != T{0}) fail(text() + " lies on an obstacle");
-            }
+        const std::int32_t* const positions = states.positions.data() + 2 * first;
+        const std::int32_t* const goals = states.goals.data() + 2 * first;
+        // One pass without messages; what is wrong is looked for only where something is.
+        std::size_t sound = 0;
+        for (; sound < n; ++sound) {
+            const std::int32_t *here = positions + 2 * sound, *goal = goals + 2 * sound;
+            if (!layout.contains(here[0], here[1]) || !layout.contains(goal[0], goal[1])) break;
+            const int cell = layout.cell(here[0], here[1]);
+            if (obstacles[cell] != T{0} || obstacles[layout.cell(goal[0], goal[1])] != T{0} || taken[cell]) break;
+            taken[cell] = 1;
         }
-        for (std::size_t i = 0; i < n; ++i) {
-            const std::int32_t* cell = states.positions.data() + 2 * (first + i);
-            std::uint8_t& here = taken[layout.cell(cell[0], cell[1])];
-            if (here) fail("two robots" + where() + " stand at " + cell_text(cell));
-            here = 1;
-        }
-        for (std::size_t i = 0; i < n; ++i)
-            taken[layout.cell(states.positions(first + i, 0), states.positions(first + i, 1))] = 0;
+        if (sound < n) fail_at(layout, obstacles, positions, goals, sound, t);
+        for (std::size_t i = 0; i < n; ++i) taken[layout.cell(positions[2 * i], positions[2 * i + 1])] = 0;
     }
 }
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <bit>
 #include <cstdint>
 #include <cstring>
 #include <vector>
@@ -266,10 +267,17 @@ void give_goals(const Teams<T>& teams, std::size_t b, TeamScratch<T>& scratch) {
 
 // Puts a move in front of the last moves (history) of a robot; the oldest is forgotten.
 inline void remember(std::int8_t move, std::int8_t* moves) {
-    std::int8_t last[history];
-    std::memcpy(last, moves, history);
-    std::memcpy(moves + 1, last, history - 1);
-    moves[0] = move;
+    static_assert(history == 16);
+    if constexpr (std::endian::native == std::endian::little) {  // two shifts of words
+        std::uint64_t words[2];
+        std::memcpy(words, moves, history);
+        words[1] = words[1] << 8 | words[0] >> 56;
+        words[0] = words[0] << 8 | static_cast<std::uint8_t>(move);
+        std::memcpy(moves, words, history);
+    } else {
+        std::memmove(moves + 1, moves, history - 1);
+        moves[0] = move;
+    }
 }
 
 // What team b wants: an action of each robot (N), or values of all five (N, 5).
@@ -338,10 +346,10 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
                      (replaced[i] ? scheme.replaced : 0.0f);
     }
     for (int i = 0; i < n; ++i) {
-        remember(executed[i], teams.moves + (first + i) * history);
         teams.arrivals[first + i] += arrived[i];
         teams.under_way[first + i] = on_goal[i] ? 0 : teams.under_way[first + i] + 1;
     }
+    for (int i = 0; i < n; ++i) remember(executed[i], teams.moves + (first + i) * history);
     if (scheme.closer != 0.0f) {
         const auto steps = layout.steps();
         const Distance* distance = teams.distances + first * layout.size();
