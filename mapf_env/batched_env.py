@@ -109,6 +109,8 @@ class BatchedEnv:
         self._graph_shape = (*teams, config.num_agents)
         self._scalars_shape = (*teams, config.num_robot_features)
         self._edge_attr_shape = (*teams, config.num_agents, config.num_edge_features)
+        self._no_scalars = np.empty((*self._scalars_shape[:-1], 0), _FLOAT)
+        self._no_edge_attr = np.empty((*self._edge_attr_shape[:-1], 0), _FLOAT)
         self._dtype = np.dtype(config.dtype)
         self._state = TeamState.empty(num_envs, config)
         self._bind()
@@ -218,8 +220,8 @@ class BatchedEnv:
         return Observation(
             np.empty(self._fov_shape, self._dtype),
             np.empty(self._graph_shape, _FLOAT),
-            np.empty(self._scalars_shape, _FLOAT),
-            np.empty(self._edge_attr_shape, _FLOAT),
+            np.empty(self._scalars_shape, _FLOAT) if self._scalars_shape[-1] else self._no_scalars,
+            np.empty(self._edge_attr_shape, _FLOAT) if self._edge_attr_shape[-1] else self._no_edge_attr,
         )
 
     @overload

@@ -85,7 +85,6 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self.action_spaces = {agent: copy.deepcopy(moves) for agent in self.possible_agents}
         self.state_space = spaces.Box(0.0, 1.0, (3, H, W), np.float32)
         self._masks_shape = (N, 5)
-        self._memory: Any = _native.MemoryFloat32 if config.dtype == "float32" else _native.MemoryUint8
         self._reused: _Reused | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -233,10 +232,16 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         agents, rows = self.possible_agents, _native.rows_by_agent
         masks = np.empty(self._masks_shape, np.int8)
         if self._observation == "dict":
-            names, columns = self._keys, tuple([getattr(buffers, key)[0] for key in self._keys])
+            names, columns = self._keys, (buffers.fov[0], buffers.graph[0])
+            if len(names) > 2:
+                columns = tuple([getattr(buffers, key)[0] for key in names])
         else:
             names, columns = (), (buffers.fov[0],)
-        return rows(agents, names, columns), rows(agents, ("action_mask",), (masks,)), self._memory(buffers, masks)
+        return (
+            rows(agents, names, columns),
+            rows(agents, ("action_mask",), (masks,)),
+            self._batch.stepper.memory(buffers, masks),
+        )
 
     def _checked(self, actions: dict[str, Any]) -> list[Any]:
         """The actions in the order of agents, or what is wrong with them."""

@@ -113,11 +113,12 @@ void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& 
                 states.comm_radius.shape(0) == count,
             "seeds, times, limits and comm_radius must have shape (T,)");
     const std::int8_t* const moves = states.moves.data();
-    const auto is_none = [](std::int8_t move) { return static_cast<std::uint8_t>(move + 1) > num_actions; };
-    bool any = false;
-    for (std::size_t i = 0; i < states.moves.size(); ++i) any |= is_none(moves[i]);
-    if (any) {
-        const auto i = static_cast<std::size_t>(std::find_if(moves, moves + states.moves.size(), is_none) - moves);
+    const std::size_t num_moves = R * history;
+    std::uint8_t most = 0;  // of moves counted from -1, which compilers find with wide registers
+    for (std::size_t i = 0; i < num_moves; ++i) most = std::max(most, static_cast<std::uint8_t>(moves[i] + 1));
+    if (most > num_actions) {
+        const auto is_none = [](std::int8_t move) { return static_cast<std::uint8_t>(move + 1) > num_actions; };
+        const auto i = static_cast<std::size_t>(std::find_if(moves, moves + num_moves, is_none) - moves);
         fail("moves must lie in -1..4, got " + std::to_string(moves[i]) + " for robot " + std::to_string(i / history));
     }
     std::vector<std::uint8_t> taken;

@@ -37,7 +37,7 @@ int process() {
 #endif
 }
 
-// Where observations go: the arrays of a `mapf_env.Observation`.
+// Where observations go: the arrays of a `mapf_env.Observation`; those without columns are not read.
 template <class T>
 struct Room {
     InOut<T, 5> fov;            // (B, N, C, side, side)
@@ -45,19 +45,6 @@ struct Room {
     InOut<float, 3> scalars;    // (B, N, K)
     InOut<float, 4> edge_attr;  // (B, N, N, D)
 };
-
-template <class T>
-Room<T> room_of(nb::handle out) {
-    Room<T> room;
-    if (!PyTuple_Check(out.ptr()) || PyTuple_GET_SIZE(out.ptr()) != 4 || !nb::try_cast(out[0], room.fov, false) ||
-        !nb::try_cast(out[1], room.graph, false) || !nb::try_cast(out[2], room.scalars, false) ||
-        !nb::try_cast(out[3], room.edge_attr, false))
-        throw nb::type_error(
-            (std::string("out must be an Observation of contiguous memory as buffers() makes it: ") +
-             (sizeof(T) == 1 ? "uint8" : "float32") + " for the views and float32 for the rest")
-                .c_str());
-    return room;
-}
 
 // Where the observations of the only team of a batch and its action masks (N, 5) go.
 template <class T>
@@ -160,7 +147,7 @@ public:
 
     // Writes what the teams perceive; with `chosen` (B) those teams only.
     void observe(nb::handle out, std::optional<In<bool, 1>> chosen) {
-        const Room<T> room = room_of<T>(out);
+        const Room<T> room = room_of(out);
         const Percepts<T> percepts = percepts_of(room);
         const bool* wanted = wanted_teams(chosen);
         nb::gil_scoped_release release;
@@ -188,6 +175,8 @@ public:
             [&](std::size_t t) { return message_key(teams_.seeds[teams[t]], teams_.times[teams[t]]); },
             [&](std::size_t count, const auto& job) { for_each(count, job); });
     }
+
+    Memory<T> memory(nb::handle out, InOut<std::int8_t, 2> masks) const { return {room_of(out), std::move(masks)}; }
 
     // What the last step brought to the only team, by agent, in dictionaries that are filled in place, and its action
     // masks. Returns whether the episode has ended.
@@ -279,6 +268,21 @@ private:
         return held.data();
     }
 
+    // Reads the arrays of an observation.
+    Room<T> room_of(nb::handle out) const {
+        Room<T> room;
+        const bool sound = PyTuple_Check(out.ptr()) && PyTuple_Size(out.ptr()) == 4;
+        const auto part = [&](Py_ssize_t i) { return nb::handle(PyTuple_GetItem(out.ptr(), i)); };
+        if (!sound || !nb::try_cast(part(0), room.fov, false) || !nb::try_cast(part(1), room.graph, false) ||
+            (options_.senses.robot_columns > 0 && !nb::try_cast(part(2), room.scalars, false)) ||
+            (options_.senses.edge_columns > 0 && !nb::try_cast(part(3), room.edge_attr, false)))
+            throw nb::type_error(
+                (std::string("out must be an Observation of contiguous memory as buffers() makes it: ") +
+                 (sizeof(T) == 1 ? "uint8" : "float32") + " for the views and float32 for the rest")
+                    .c_str());
+        return room;
+    }
+
     // The memory of a room whose shapes are right.
     Percepts<T> percepts_of(const Room<T>& room) const {
         const auto& senses = options_.senses;
@@ -291,9 +295,16 @@ private:
         };
         fits(room.fov, {B, N, C, side, side}, "views");
         fits(room.graph, {B, N, N}, "graphs");
-        fits(room.scalars, {B, N, K}, "scalars");
-        fits(room.edge_attr, {B, N, N, D}, "edge_attr");
-        return {room.fov.data(), room.graph.data(), room.scalars.data(), room.edge_attr.data()};
+        Percepts<T> percepts{room.fov.data(), room.graph.data(), nullptr, nullptr};
+        if (K > 0) {
+            fits(room.scalars, {B, N, K}, "scalars");
+            percepts.scalars = room.scalars.data();
+        }
+        if (D > 0) {
+            fits(room.edge_attr, {B, N, N, D}, "edge_attr");
+            percepts.edge_attr = room.edge_attr.data();
+        }
+        return percepts;
     }
 
     const bool* wanted_teams(const std::optional<In<bool, 1>>& chosen) const {
@@ -336,7 +347,7 @@ private:
 
     void run(Wishes wishes, nb::handle out, bool skip_ended) {
         if (out.is_none()) return run(wishes, nullptr, skip_ended);
-        const Room<T> room = room_of<T>(out);
+        const Room<T> room = room_of(out);
         const Percepts<T> percepts = percepts_of(room);
         run(wishes, &percepts, skip_ended);
     }
@@ -375,12 +386,7 @@ private:
 
 template <class T>
 void define(nb::module_& m, const char* name, const char* memory) {
-    nb::class_<Memory<T>>(m, memory, "Where the observations and action masks of the only team of a batch go.")
-        .def("__init__",
-             [](Memory<T>* self, nb::handle out, InOut<std::int8_t, 2> masks) {
-                 new (self) Memory<T>{room_of<T>(out), std::move(masks)};
-             },
-             "out"_a, "masks"_a.noconvert());
+    nb::class_<Memory<T>>(m, memory, "Where the observations and action masks of the only team of a batch go.");
     nb::class_<Stepper<T>>(m, name, "The rules of motion and perception, bound to the arrays of B teams.")
         .def(nb::init<nb::object, nb::handle, int>(), "state"_a, "config"_a, "threads"_a)
         .def("step", &Stepper<T>::step, "actions"_a, "out"_a.none(), "skip_ended"_a,
@@ -391,6 +397,8 @@ void define(nb::module_& m, const char* name, const char* memory) {
              "Write what the robots perceive, of all teams or of the chosen ones (B,).")
         .def("bag", &Stepper<T>::bag, "chosen"_a.none(),
              "The bag of the teams that are under way, all of them or the chosen ones (B,).")
+        .def("memory", &Stepper<T>::memory, "out"_a, "masks"_a.noconvert(),
+             "An observation of the only team and masks (N, 5) as memory for `step_agents` and `outcome_by_agent`.")
         .def("outcome_by_agent", &Stepper<T>::outcome_by_agent, "memory"_a, "agents"_a, "rewards"_a, "terminated"_a,
              "truncated"_a, "infos"_a,
              "Write the masks and fill dictionaries with what the last step brought to the agents of the only team.")

@@ -185,8 +185,8 @@ template <class T>
 struct Percepts {
     T* fov;            // (N, planes, side, side)
     float* graph;      // (N, N)
-    float* scalars;    // (N, robot_columns)
-    float* edge_attr;  // (N, N, edge_columns)
+    float* scalars;    // (N, robot_columns), if there are any
+    float* edge_attr;  // (N, N, edge_columns), if there are any
 };
 
 // Writes what team b perceives; zeros for robots that are not there, and for the features of edges that do not exist.
@@ -218,7 +218,7 @@ void perceive(const Teams<T>& teams, const Options& options, std::size_t b, Team
         std::fill_n(out.fov + n * view, (N - n) * view, T{0});
         for (std::size_t i = 0; i < n; ++i) std::fill_n(out.graph + i * N + n, N - n, 0.0f);
         std::fill_n(out.graph + n * N, (N - n) * N, 0.0f);
-        std::fill_n(out.scalars + n * scalars, (N - n) * scalars, 0.0f);
+        if (scalars > 0) std::fill_n(out.scalars + n * scalars, (N - n) * scalars, 0.0f);
     }
 }
 

@@ -669,8 +669,11 @@ def test_observations_are_written_into_the_callers_memory() -> None:
     wrong = out._replace(fov=np.empty((2, 3, 3, 11, 10), np.float32))
     with pytest.raises(ValueError, match="the memory for views must have shape"):
         env.step([[4, 4, 4]] * 2, out=wrong)
-    with pytest.raises(ValueError, match=r"the memory for scalars must have shape \(2, 3, 0\)"):
-        env.step([[4, 4, 4]] * 2, out=out._replace(scalars=np.empty((2, 3, 1), np.float32)))
+    for features in ({"robot_features": ("on_goal",)}, {"edge_features": ("on_goal",)}):
+        more = BatchedEnv(2, num_agents=3, **features)
+        more.reset(seed=0, out=more.buffers())
+        with pytest.raises(ValueError, match=r"the memory for (scalars|edge_attr) must have shape \(2, 3, (3, )?1\)"):
+            more.step([[4, 4, 4]] * 2, out=out)
     for wrong in (out._replace(fov=out.fov.astype(np.float64)), tuple(out)[:2], out.fov):
         with pytest.raises(TypeError, match="out must be an Observation of contiguous memory as buffers"):
             env.step([[4, 4, 4]] * 2, out=wrong)  # pyright: ignore[reportCallIssue, reportArgumentType]
