@@ -1,5 +1,6 @@
 """What a user may rely on once the package is installed."""
 
+import ast
 import importlib.metadata
 import importlib.util
 import subprocess
@@ -86,3 +87,15 @@ def test_every_public_name_exists() -> None:
     assert sorted(mapf_env.__all__, key=str.lower) == sorted(set(mapf_env.__all__), key=str.lower)
     for name in mapf_env.__all__:
         assert getattr(mapf_env, name) is not None
+
+
+@pytest.mark.parametrize("package", ["experts"])
+def test_no_package_uses_the_native_module_of_another(package: str) -> None:
+    """What a package offers others has a public name; the contracts of imports do not see compiled modules."""
+    for source in sorted((ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] != package:
+                named = {node.module.rpartition(".")[2], *(alias.name for alias in node.names)}
+                assert "_native" not in named, f"{source} line {node.lineno}"
+            if isinstance(node, ast.Import):
+                assert not any(alias.name.endswith("._native") for alias in node.names), f"{source} line {node.lineno}"

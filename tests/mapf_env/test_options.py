@@ -669,7 +669,8 @@ def test_observations_are_written_into_the_callers_memory() -> None:
     wrong = out._replace(fov=np.empty((2, 3, 3, 11, 10), np.float32))
     with pytest.raises(ValueError, match="the memory for views must have shape"):
         env.step([[4, 4, 4]] * 2, out=wrong)
-    for features in ({"robot_features": ("on_goal",)}, {"edge_features": ("on_goal",)}):
+    lists: list[dict[str, Any]] = [{"robot_features": ("on_goal",)}, {"edge_features": ("on_goal",)}]
+    for features in lists:
         more = BatchedEnv(2, num_agents=3, **features)
         more.reset(seed=0, out=more.buffers())
         with pytest.raises(ValueError, match=r"the memory for (scalars|edge_attr) must have shape \(2, 3, (3, )?1\)"):

@@ -1,16 +1,19 @@
 // Random teams under all options of the native core, to be run with AddressSanitizer and UBSan:
 //   c++ -std=c++20 -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all -I. tests/native/fuzz_world.cpp
-//     mapf_env/native/graph.cpp mapf_env/native/generate.cpp mapf_env/native/observe.cpp -o fuzz_world && ./fuzz_world SECONDS
+//     mapf_env/native/graph.cpp mapf_env/native/generate.cpp mapf_env/native/observe.cpp mapf_env/native/senses.cpp
+//     -o fuzz_world && ./fuzz_world SECONDS
 // Every buffer has exactly the size that it needs, and every executed step is checked for conflicts.
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
 #include <memory>
 #include <set>
+#include <string>
 #include <vector>
 
 #include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/generate.hpp"
+#include "mapf_env/native/senses.hpp"
 #include "mapf_env/native/team_step.hpp"
 
 namespace {
@@ -51,14 +54,18 @@ void play(std::uint64_t seed) {
     place_agents(grid, n, random, starts.data(), ends.data());
 
     Options options;
-    options.fov_radius = radius;
     options.pibt = random.below(2);
     options.lifelong = random.below(2);
-    options.max_cycles = 1 + random.below(40);
-    options.weights = static_cast<Weights>(random.below(2));
     options.message_loss = random.below(3) / 2.0;
-    for (int channel = 0; channel < 3; ++channel)
-        if (random.below(2)) options.extras.push_back(static_cast<Channel>(channel));
+    const auto some = [&](auto rows) {
+        std::vector<std::string> names;
+        for (const auto& row : rows)
+            if (random.below(2)) names.emplace_back(row.name);
+        return names;
+    };
+    const auto weights = static_cast<Weights>(random.below(2));
+    options.senses = Senses(radius, 1 + random.below(history), weights, some(channels().subspan(num_channels)),
+                            some(robot_features()), some(edge_features()));
     options.rewards = {1.0f, -1.0f, 0.5f, -0.5f, 3.0f, static_cast<float>(random.below(2))};
 
     options.comm_radius = 0.5 + random.below(5);
@@ -68,6 +75,7 @@ void play(std::uint64_t seed) {
     std::uint64_t episode = 0;
     double comm_radius = 0.0;
     std::int64_t time = 0;
+    std::int32_t max_cycles = 0;
     std::vector<T> map(size, T{1});
     std::vector<std::int32_t> positions(2 * N), goals(2 * N), previous(2 * N), under_way(N), arrivals(N), regions(size, -1);
     std::vector<Distance> distances(N * size);
@@ -76,40 +84,49 @@ void play(std::uint64_t seed) {
     std::vector<float> rewards(N), graph(N * N);
     std::unique_ptr<bool[]> replaced(new bool[N]()), arrived(new bool[N]()), on_goal(new bool[N]());
     std::vector<std::int8_t> mask(N * num_actions);
-    const std::size_t side = 2 * radius + 3;
-    std::vector<T> fov(N * (num_channels + options.extras.size()) * side * side);
+    std::vector<std::int8_t> moves(N * history);
+    std::vector<T> fov(N * options.senses.view());
+    std::vector<float> scalars(N * options.senses.robot_columns), edge_attr(N * N * options.senses.edge_columns);
     teams.grids = cells_blocked.get(), teams.started = &started;
     teams.obstacles = map.data(), teams.team_sizes = &team_size, teams.seeds = &episode, teams.comm_radius = &comm_radius;
     teams.regions = regions.data(), teams.positions = positions.data(), teams.goals = goals.data();
-    teams.previous = previous.data(), teams.under_way = under_way.data(), teams.arrivals = arrivals.data();
+    teams.moves = moves.data(), teams.max_cycles = &max_cycles, teams.under_way = under_way.data(), teams.arrivals = arrivals.data();
     teams.distances = distances.data(), teams.times = &time, teams.ended = &ended, teams.rewards = rewards.data();
     teams.terminated = &terminated, teams.truncated = &truncated, teams.replaced = replaced.get();
     teams.arrived = arrived.get(), teams.on_goal = on_goal.get(), teams.action_mask = mask.data();
 
-    begin_team(teams, options, 0, seed, case_of(teams, drawn.data(), starts.data(), ends.data(), n));
+    begin_team(teams, options, 0, seed, 1 + random.below(40), case_of(teams, drawn.data(), starts.data(), ends.data(), n));
     for (int i = 0; i < 2 * n; ++i) require(positions[i] == starts[i] && goals[i] == ends[i], "another case began", seed);
     for (std::size_t i = 0; i < area; ++i) require(cells_blocked[i] == (drawn[i] != 0), "another map", seed);
 
     TeamScratch<T> scratch(teams.layout, static_cast<int>(N));
     std::vector<std::int64_t> actions(N);
     std::vector<float> values(N * num_actions);
+    std::vector<int> standing;
     while (!ended) {
         for (auto& action : actions) action = random.below(num_actions);
         for (auto& value : values) value = static_cast<float>(random.below(7));
         const bool by_values = options.pibt && random.below(2);
+        previous = positions;
         step_team(teams, options, 0, {actions.data(), by_values ? values.data() : nullptr}, scratch);
-        perceive(teams, options, 0, scratch, fov.data(), graph.data());
+        perceive(teams, options, 0, scratch, Percepts<T>{fov.data(), graph.data(), scalars.data(), edge_attr.data()});
+        std::vector<Edge> edges;
+        find_edges(teams.layout, positions.data(), n, comm_radius, weights, options.message_loss,
+                   message_key(episode, time), standing, edges);
+        std::vector<float> same(N * N);
+        for (const Edge& edge : edges) same[edge.receiver * N + edge.sender] = edge.weight;
+        require(same == graph, "the edges are not those of the graph", seed);
         write_action_mask(teams, 0);
         std::set<int> cells;
-        std::set<std::pair<int, int>> moves;
+        std::set<std::pair<int, int>> ways;
         for (int i = 0; i < n; ++i) {
             const int from = teams.layout.cell(previous[2 * i], previous[2 * i + 1]);
             const int to = teams.layout.cell(positions[2 * i], positions[2 * i + 1]);
             require(teams.layout.contains(positions[2 * i], positions[2 * i + 1]), "a robot left the map", seed);
             require(map[to] == T{0}, "a robot entered an obstacle", seed);
             require(cells.insert(to).second, "two robots in one cell", seed);
-            require(from == to || moves.count({to, from}) == 0, "two robots exchanged cells", seed);
-            moves.insert({from, to});
+            require(from == to || ways.count({to, from}) == 0, "two robots exchanged cells", seed);
+            ways.insert({from, to});
         }
         for (const T mark : scratch.marks) require(mark == T{0}, "marks were left", seed);
     }
