@@ -112,24 +112,24 @@ def plot(options: argparse.Namespace, console: Console) -> None:
         for col, num_agents in enumerate(sizes):
             axis = axes[row][col]
             instances = [make(num_agents, seed) for seed in range(cases)]
+            unsolved = []
             for marker, (name, solver) in zip("sv^o*P", solvers.items(), strict=True):
                 results, milliseconds = timed(solver, instances)
                 printed.add_row(family, str(num_agents), name, *summary(results, milliseconds))
                 solved = [result for result in results if result.cost is not None]
-                if not solved:
-                    axis.plot([], [], marker, label=f"{name}: none")
-                    continue
-                ratio = sum(result.cost or 0 for result in solved) / sum(lower_bound(each) for each in solved)
-                share = "" if len(solved) == len(results) else f" ({len(solved) / len(results):.0%})"
-                axis.plot(np.median(milliseconds), ratio, marker, label=name + share, alpha=len(solved) / len(results))
-            axis.set(
-                xscale="log", title=f"{family}, {num_agents} robots", ylabel="cost / distances" if col == 0 else ""
-            )
-            axis.title.set_fontsize(8)
-            axis.legend(fontsize=5)
+                share = len(solved) / len(results)
+                ratio = sum(result.cost or 0 for result in solved) / max(sum(map(lower_bound, solved)), 1)
+                x, y = ([np.median(milliseconds)], [ratio]) if solved else ([], [])
+                axis.plot(x, y, marker, label=name, alpha=max(share, 0.2))
+                if share < 1:
+                    unsolved.append(f"{name}: {share:.0%}")
+            axis.set(xscale="log", ylabel="cost / bound" if col == 0 else "")
+            axis.set_title(f"{family}, {num_agents} robots", fontsize=8)
+            axis.text(0.98, 0.97, "\n".join(unsolved), transform=axis.transAxes, ha="right", va="top", fontsize=6)
     for axis in axes[-1]:
         axis.set_xlabel("median ms")
-    figure.tight_layout()
+    figure.tight_layout(rect=(0, 0, 1, 0.97))
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="upper center", ncols=len(solvers), fontsize=8)
     figure.savefig(options.out, dpi=110)
     console.print(printed)
     console.print(f"wrote {options.out}")

@@ -146,6 +146,7 @@ def _solve(options: argparse.Namespace) -> int:
         print(f"ratio        {result.cost / result.lower_bound:.4f}")
     if result.solution is not None:
         print(f"makespan     {result.solution.makespan}")
+        print(f"found by     {result.found_by}")
     print(f"expansions   {result.expansions}")
     print(f"seconds      {result.seconds:.6f}")
     if result.solution is None:
