@@ -243,9 +243,9 @@ def perceive(states: States, maps: MapSet, senses: Senses, *, message_loss: floa
     arguments.share(message_loss, "message_loss")
     arrays = [_array(getattr(states, name), name) for name in _ARRAYS]
     workers = arguments.integer(threads, "threads", 1, arguments.MOST_THREADS)
-    compiled = _compiled(senses, maps.dtype.name)
+    _require_dtype(senses, maps.dtype.name)
     kernel: Any = _native.perceive  # of which there is one for each dtype
-    return Bag(*kernel(maps._cells, maps._offsets, maps._sizes, maps.border, *arrays, compiled, message_loss, workers))
+    return Bag(*kernel(maps._cells, maps._offsets, maps._sizes, maps.border, *arrays, senses, message_loss, workers))
 
 
 _ARRAYS = {
@@ -281,7 +281,7 @@ def _array(given: Any, name: str) -> npt.NDArray[Any]:
 
 
 @lru_cache(maxsize=64)
-def _compiled(senses: Senses, dtype: str) -> _native.Senses:
+def _require_dtype(senses: Senses, dtype: str) -> None:
+    """Raise ValueError if views of that dtype cannot hold what is sensed; the answer is remembered between calls."""
     if dtype == "uint8":
         require_bytes(senses)
-    return _native.Senses(senses)

@@ -227,11 +227,11 @@ void define_for_dtype(nb::module_& m) {
            In<std::int32_t, 1> maps, In<std::int64_t, 1> offsets, In<std::int32_t, 2> positions,
            In<std::int32_t, 2> goals, In<std::int8_t, 2> moves, In<std::int32_t, 1> under_way,
            In<std::uint64_t, 1> seeds, In<std::int32_t, 1> times, In<std::int32_t, 1> limits,
-           In<double, 1> comm_radius, const Senses& senses, double message_loss, int threads) {
+           In<double, 1> comm_radius, nb::handle senses, double message_loss, int threads) {
             return perceive_states<T>(
                 {cells, map_offsets, map_sizes, pad},
-                {maps, offsets, positions, goals, moves, under_way, seeds, times, limits, comm_radius}, senses,
-                message_loss, threads);
+                {maps, offsets, positions, goals, moves, under_way, seeds, times, limits, comm_radius},
+                senses_of(senses), message_loss, threads);
         },
         "cells"_a, "map_offsets"_a, "map_sizes"_a, "pad"_a, "maps"_a, "offsets"_a, "positions"_a, "goals"_a, "moves"_a,
         "under_way"_a, "seeds"_a, "times"_a, "limits"_a, "comm_radius"_a, "senses"_a, "message_loss"_a, "threads"_a,
@@ -242,8 +242,6 @@ void define_for_dtype(nb::module_& m) {
 
 void define_perceive(nb::module_& m) {
     m.attr("HISTORY") = history;
-    nb::class_<Senses>(m, "Senses", "The senses of robots, compiled from the fields of a `mapf_env.Senses`.")
-        .def("__init__", [](Senses* self, nb::object config) { new (self) Senses(senses_of(config)); }, "config"_a);
     m.def("channels", &channel_rows, "fov_radius"_a,
           "(name, low, high, unit, needs_map, needs_history) of each channel of the views, the paper's three first.");
     m.def("robot_features", [](int memory) { return feature_rows(robot_features(), memory); }, "memory"_a,
