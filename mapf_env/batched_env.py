@@ -211,6 +211,11 @@ class BatchedEnv:
         return np.arange(self.num_agents) < self._state.team_sizes[:, None]
 
     @property
+    def running(self) -> npt.NDArray[np.bool_]:
+        """(B,) the teams that have begun and not ended."""
+        return self._state.started & ~self._state.ended
+
+    @property
     def began(self) -> bool:
         """Whether all environments have been reset."""
         return bool(self._state.started.all())

@@ -18,20 +18,24 @@ Integers = npt.NDArray[np.integer]
 
 
 class Bag(NamedTuple):
-    """What M robots of any number of teams perceive, in the conventions of PyTorch Geometric."""
+    """What M robots of any number of teams perceive, in the conventions of PyTorch Geometric.
 
-    fov: npt.NDArray[Any]
+    `perceive` and `BatchedEnv.bag` fill it with NumPy arrays; a network gets the same fields as tensors.
+    """
+
+    fov: Any
     """(M, C, S, S) fields of view, float32 or uint8."""
-    scalars: npt.NDArray[np.float32]
-    """(M, K) what each robot knows about itself, by `Senses.robot_features`."""
-    edge_index: npt.NDArray[np.int64]
-    """(2, E) the sender and the receiver of each edge, as numbers of robots of the bag; by receiver, then sender."""
-    edge_weight: npt.NDArray[np.float32]
-    """(E,) weights of the communication graph."""
-    edge_attr: npt.NDArray[np.float32]
-    """(E, D) what the receiver knows about the sender, by `Senses.edge_features`."""
-    team: npt.NDArray[np.int64]
-    """(M,) the team of each robot, ascending."""
+    scalars: Any
+    """(M, K) float32, what each robot knows about itself, by `Senses.robot_features`."""
+    edge_index: Any
+    """(2, E) int64, the sender and the receiver of each edge, as numbers of robots of the bag; by receiver, then
+    sender."""
+    edge_weight: Any
+    """(E,) float32, weights of the communication graph."""
+    edge_attr: Any
+    """(E, D) float32, what the receiver knows about the sender, by `Senses.edge_features`."""
+    team: Any
+    """(M,) int64, the team of each robot, ascending."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,17 +76,18 @@ class States:
         """(R,) the team of each robot, ascending."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
+    def rows(self, chosen: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return the rows of the robots of the chosen teams (B,), by their numbers or as a mask (T,), in order."""
+        teams = _numbers(chosen)
+        sizes = np.diff(self.offsets)[teams]
+        ends = np.cumsum(sizes, dtype=np.int64)
+        return np.arange(ends[-1] if len(ends) else 0) + np.repeat(self.offsets[teams] - ends + sizes, sizes)
+
     def take(self, chosen: npt.ArrayLike) -> States:
         """The chosen teams (B,), by their numbers or as a mask (T,), in the order given."""
-        teams = arguments.array(chosen, "chosen")
-        if teams.dtype == np.bool_:
-            teams = np.flatnonzero(teams)
-        elif teams.size and teams.dtype.kind not in "iu":
-            raise TypeError(f"chosen must be numbers of teams or a mask, got dtype {teams.dtype}")
-        teams = teams.astype(np.intp, copy=False)
-        sizes = np.diff(self.offsets)[teams]
+        teams = _numbers(chosen)
+        sizes, robots = np.diff(self.offsets)[teams], self.rows(teams)
         offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes, dtype=np.int64)])
-        robots = np.arange(offsets[-1]) + np.repeat(self.offsets[teams] - offsets[:-1], sizes)
         return States(
             maps=self.maps[teams],
             offsets=offsets,
@@ -147,6 +152,15 @@ class States:
     def stuck(self) -> npt.NDArray[np.bool_]:
         """(R,) the robots that are off their goal, on a cell where they stood at one of their last HISTORY steps."""
         return is_stuck(self.positions, self.goals, self.moves)
+
+
+def _numbers(chosen: npt.ArrayLike) -> npt.NDArray[np.intp]:
+    teams = arguments.array(chosen, "chosen")
+    if teams.dtype == np.bool_:
+        return np.flatnonzero(teams)
+    if teams.size and teams.dtype.kind not in "iu":
+        raise TypeError(f"chosen must be numbers of teams or a mask, got dtype {teams.dtype}")
+    return teams.astype(np.intp, copy=False)
 
 
 _OF_TEAMS = ("seeds", "times", "limits", "comm_radius")

@@ -118,7 +118,7 @@ def parse_pogema_map(drawing: str) -> PogemaMap:
 def load_pogema_maps(path: PathLike) -> dict[str, PogemaMap]:
     """Read a file of POGEMA's maps: each map under its name, in the order of the file.
 
-    Of YAML the file has what POGEMA's benchmark uses: a line `name: |-`, and below it the indented rows of the map;
+    Of YAML the file has what POGEMA's benchmark uses: a line ``name: |-``, and below it the indented rows of the map;
     lines that begin with `# ` are comments. A file without names is one map, which gets the name of the file.
 
     Raises:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mapf_env.files import PathLike
 from mapf_env.generation import random_instance
-from mapf_env.instance import Instance
-from mapf_env.instance_set import InstanceSet
+from mapf_env.instance import Instance, Obstacles
+from mapf_env.instance_set import InstanceSet, load_instances
 from mapf_env.movingai import load_map, load_scen
 from mapf_env.pogema_maps import load_pogema_maps
 
@@ -47,6 +47,42 @@ def load_problem(file: PathLike, *, agents: int | None, map: PathLike | None, in
     if agents is None:
         raise ValueError("robots on a map are placed at random: give --agents N (and --seed S)")
     return random_instance(grid=load_map(file), num_agents=agents, seed=seed)
+
+
+def load_problems(path: PathLike) -> list[tuple[Obstacles, list[Instance]]]:
+    """Return the maps in a file or a folder, each with the instances that the file has on it.
+
+    Args:
+        path: A map (.map), which has no instances; a scenario (.scen), one instance with all its robots; a set of
+            instances (.json); maps of POGEMA (.yaml); or a folder, all such files of which are read in alphabetical
+            order.
+
+    Raises:
+        ValueError: If a file is damaged or of another kind, or a folder has none of these files.
+        OSError: If a file cannot be read.
+    """
+    place = Path(path)
+    if place.is_dir():
+        files = sorted(each for each in place.iterdir() if each.suffix.lower() in (".scen", ".map", ".json", ".yaml"))
+        if not files:
+            raise ValueError(
+                f"the folder {path} has no maps (.map, .yaml), scenarios (.scen) or sets of instances (.json)"
+            )
+        return [problem for file in files for problem in load_problems(file)]
+    kind = place.suffix.lower()
+    if kind == ".map":
+        return [(load_map(path), [])]
+    if kind == ".scen":
+        instance = load_scen(path)
+        return [(instance.grid, [instance])]
+    if kind == ".json":
+        return [(instance.grid, [instance]) for instance in load_instances(path)]
+    if kind == ".yaml":
+        return [(each.grid, []) for each in load_pogema_maps(path).values()]
+    raise ValueError(
+        f"{path} must be a map (.map), a scenario (.scen), a set of instances (.json), maps of POGEMA (.yaml) or a "
+        "folder of these"
+    )
 
 
 def _of_set(file: PathLike, index: int, agents: int | None) -> Instance:

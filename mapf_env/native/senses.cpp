@@ -142,6 +142,23 @@ void write_greedy_moves(const TeamFacts& team, int, int robot, float* out) {
     for (int action = 0; action < num_actions; ++action) out[action] = team.greedy[robot] >> action & 1 ? 1.0f : 0.0f;
 }
 
+// Off the goal, on a cell where the robot stood at one of its last steps: it was stopped, or came back.
+void write_stuck(const TeamFacts& team, int, int robot, float* out) {
+    *out = 0.0f;
+    if (team.on_goal(robot)) return;
+    int down = 0, right = 0;
+    for (int k = 0; k < history; ++k) {
+        const int move = team.moves[robot * history + k];
+        if (move < 0) return;
+        down += row_step[move];
+        right += col_step[move];
+        if (down == 0 && right == 0) {
+            *out = 1.0f;
+            return;
+        }
+    }
+}
+
 // ---- features of edges alone
 
 void write_relative_position(const TeamFacts& team, int, int receiver, int sender, float* out) {
@@ -201,6 +218,7 @@ constexpr std::array all_robot_features{
     RobotFeature{"steps_to_go", width<1>, 0, 1, true, false, write_steps_to_go},
     RobotFeature{"under_way", width<1>, 0, 1, false, true, write_under_way},
     RobotFeature{"greedy_moves", width<5>, 0, 1, true, false, write_greedy_moves},
+    RobotFeature{"stuck", width<1>, 0, 1, false, true, write_stuck},
 };
 
 constexpr std::array all_edge_features{

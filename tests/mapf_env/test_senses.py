@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import oracles
 import strategies
-from mapf_env import HISTORY, EnvConfig, MapSet, Senses, States, perceive, rules
+from mapf_env import HISTORY, MOVES, EnvConfig, MapSet, Senses, States, perceive, rules
 from mapf_env.senses import channels, edge_features, robot_features
 
 
@@ -161,6 +161,17 @@ def greedy_moves(world: World, robot: int) -> list[float]:
     return [action in world.greedy(robot) for action in range(5)]
 
 
+def stuck(world: World, robot: int) -> list[float]:
+    row, col = world.team[robot]
+    earlier = []
+    for move in world.moves[robot]:
+        if move < 0:
+            break
+        row, col = row - MOVES[move][0], col - MOVES[move][1]
+        earlier.append((row, col))
+    return [world.team[robot] != world.goals[robot] and tuple(world.team[robot]) in earlier]
+
+
 ROBOT_FEATURES: dict[str, Callable[[World, int], list[float]]] = {
     "last_moves": last_moves,
     "on_goal": on_goal,
@@ -168,6 +179,7 @@ ROBOT_FEATURES: dict[str, Callable[[World, int], list[float]]] = {
     "steps_to_go": steps_to_go,
     "under_way": under_way,
     "greedy_moves": greedy_moves,
+    "stuck": stuck,
 }
 
 
@@ -287,7 +299,7 @@ def test_what_needs_the_map_says_so() -> None:
     assert Senses(edge_features=("greedy_moves",)).needs_map
     tables = channels(), robot_features(), edge_features()
     history = {name for table in tables for name, facts in table.items() if facts.needs_history}
-    assert history == {"previous_positions", "last_moves", "under_way", "priority"}
+    assert history == {"previous_positions", "last_moves", "under_way", "priority", "stuck"}
 
 
 def test_the_senses_of_an_environment_are_passed_on_as_settings() -> None:
