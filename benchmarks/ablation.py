@@ -26,12 +26,13 @@ from rich.console import Console
 import experts
 from gnn_policy.command_line import run_command
 from gnn_policy.config import RECIPES, TrainConfig
-from gnn_policy.dagger import Teacher
 from gnn_policy.evaluation import Estimate, Exam
+from gnn_policy.execution import Execution
 from gnn_policy.progress import TrainingProgress
-from gnn_policy.rollout import Teams, rollout
-from gnn_policy.training import Training, split_cases
-from mapf_env import Solution
+from gnn_policy.rollout import rollout
+from gnn_policy.teacher import Teacher
+from gnn_policy.training import Training
+from mapf_env import Action, BatchedEnv, Solution
 from mapf_env.files import replacing, write_whole
 
 Variants = dict[str, dict[str, Any]]
@@ -138,7 +139,7 @@ def train(options: Options, name: str, config: TrainConfig, console: Console) ->
     with progress:
         training.run()
     exam = the_exam()
-    played = rollout(training.policy, exam.instances, max_steps=exam.max_steps)
+    played = rollout(training.policy, exam.instances, execution=Execution(), max_steps=exam.max_steps)
     spent = np.cumsum([row.collect_seconds + row.fit_seconds for row in training.history])
     rows = training.history
     result = {
@@ -181,7 +182,7 @@ def outcome(options: Options, name: str, seed: int) -> dict[str, Any] | None:
     folder = run_folder(options.runs, name, seed)
     if not (folder / "outcome.json").exists():
         return None
-    found = TrainConfig.load(folder / "config.json")
+    found = TrainConfig.load(folder / "config.toml")
     config_of(options, name, seed).refuse_other(found, f"{folder} holds a run of", "--runs")
     return json.loads((folder / "outcome.json").read_text())
 
@@ -200,21 +201,34 @@ def expected_minutes(options: Options, variants: Variants) -> float:
 @functools.cache
 def the_exam() -> Exam:
     """The same validation cases and time limits for all, whatever taught."""
-    return Exam.prepare(split_cases(BASE, "validation"), w=BASE.w, timeout=BASE.timeout, threads=1)
+    return Exam.prepare(BASE.cases("validation").instances, w=BASE.w, timeout=BASE.timeout, threads=1)
 
 
 class TeacherActor:
-    """Asks the teacher anew in every state and does what it says."""
+    """Asks the teacher again in every state and does what it says.
 
-    border, memory = 1, 0
+    Args:
+        teacher: The teacher.
+        grids: Its maps, all of one size.
+    """
 
-    def __init__(self, teacher: Teacher) -> None:
+    def __init__(self, teacher: Teacher, grids: Sequence[npt.NDArray[np.bool_]]) -> None:
         self.teacher, self.states = teacher, 0
+        self._number = {grid.tobytes(): number for number, grid in enumerate(grids)}
 
-    def act(self, teams: Teams) -> npt.NDArray[np.int8]:
-        """The labels (B, N)."""
-        self.states += len(teams.cases)
-        return self.teacher.moves(teams.cases, teams.positions)[0]
+    def env_settings(self) -> dict[str, Any]:
+        """Return the settings of an environment in which nothing is perceived that costs time."""
+        return {"fov_radius": 1, "comm_radius": 0.0}
+
+    def act(self, env: BatchedEnv) -> npt.NDArray[np.int64]:
+        """Return the labels (B, N)."""
+        running = np.flatnonzero(env.running)
+        maps = np.array([self._number[grid.tobytes()] for grid in env.grids[running]], np.int32)
+        moves, _ = self.teacher.moves(replace(env.states(env.running), maps=maps))
+        actions = np.full((env.num_envs, env.num_agents), Action.IDLE)
+        actions[running] = moves.reshape(len(running), -1)
+        self.states += len(running)
+        return actions
 
 
 def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
@@ -228,8 +242,9 @@ def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
             continue
         console.print(f"quality of labels: {name}")
         config = replace(BASE, **settings)
+        grids = list({each.grid.tobytes(): each.grid for each in exam.instances}.values())
         teacher = Teacher(
-            exam.instances,
+            grids,
             solver=config.teacher,
             w=config.w,
             robot_order=config.robot_order,
@@ -237,7 +252,7 @@ def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
             threads=1,
             clock=time.process_time,
         )
-        actor = TeacherActor(teacher)
+        actor = TeacherActor(teacher, grids)
         played = rollout(actor, exam.instances, max_steps=exam.max_steps)
         solved = played.success
         known[name] = {

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapf_env import Instance, _native, load_instances, load_map, load_scen, save_instances, save_map, save_scen
+from mapf_env import load_instances, load_map, load_scen, random_instance, save_instances, save_map, save_scen
 
 
 def round_trip(path: Path, folder: Path) -> int:
@@ -37,14 +37,7 @@ def many_cases(folder: Path, height: int = 656, width: int = 1491, sets: int = 1
     """Print how long it takes to write and read cases of ten robots on one map."""
     rng = np.random.default_rng(0)
     grid = rng.random((height, width)) < 0.2
-    regions = _native.regions(grid)
-    region = np.argwhere(regions == np.bincount(regions[regions >= 0]).argmax())
-
-    def case() -> Instance:
-        starts, goals = (region[rng.choice(len(region), 10, replace=False)] for _ in range(2))
-        return Instance(grid, starts, goals)
-
-    instances = [case() for _ in range(sets)]
+    instances = [random_instance(grid=grid, num_agents=10, seed=seed) for seed in range(sets)]
     save_map(folder / "a.map", grid)
     for number, instance in enumerate(instances):
         save_scen(folder / f"{number}.scen", instance, folder / "a.map")

@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import torch
 import tyro
@@ -26,16 +26,19 @@ from rich.console import Console
 from rich.progress import Progress
 
 from gnn_policy import checkpoint, evaluation
+from gnn_policy.acting import tensors
 from gnn_policy.command_line import run_command
 from gnn_policy.config import RECIPES
 from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.precision import autocast, resolved
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.results_file import refuse_other_settings
 from gnn_policy.rollout import rollout
 from gnn_policy.run_folder import RunLockedError
-from gnn_policy.training import Training, split_cases
+from gnn_policy.training import Training
+from mapf_env import Bag, BatchedEnv
 from mapf_env.files import write_whole
 from paper_experiment import Experiment, Model, Options, Scene, W
 from paper_figures import draw
@@ -154,10 +157,12 @@ def _exam(experiment: Experiment, scene: Scene) -> evaluation.Exam:
         styles=(scene.style,),
         height=scene.size,
         width=scene.size,
+        num_agents=scene.num_agents,
         cases_per_map=experiment.cases_per_map(scene),
     )
-    cases = split_cases(config, "test", scene.num_agents)
-    return evaluation.Exam.prepare(cases, w=W, timeout=config.timeout, threads=experiment.threads)
+    return evaluation.Exam.prepare(
+        config.cases("test").instances, w=W, timeout=config.timeout, threads=experiment.threads
+    )
 
 
 def _play(
@@ -167,7 +172,7 @@ def _play(
     rows, failures = [], {}
     for execution in experiment.executions(model, model.trained_for(scene)):
         with autocast(experiment.options.precision, torch.device("cpu")):
-            played = rollout(policy, exam.instances, max_steps=exam.max_steps, **asdict(execution))
+            played = rollout(policy, exam.instances, execution=execution, max_steps=exam.max_steps)
         rows.append(evaluation.score(execution.name, exam, played))
         failures[execution.name] = count_failures(played)
     return rows, failures
@@ -178,13 +183,12 @@ def _training_seconds(model: Model) -> float:
     config = model.config
     policy = DecentralizedPolicy(config.policy)
     optimizer = torch.optim.Adam(policy.parameters(), fused=True)
-    fov = torch.zeros(config.batch_size, model.num_agents, config.policy.channels, 11, 11)
-    graph = torch.zeros(config.batch_size, model.num_agents, model.num_agents)
+    bag = _bag(config.policy, config.batch_size, model.num_agents)
 
     def step() -> None:
         optimizer.zero_grad()
-        with autocast(config.precision, fov.device):
-            logits = policy(fov, graph)
+        with autocast(config.precision, bag.fov.device):
+            logits = policy(bag)
         logits.float().square().mean().backward()
         optimizer.step()
 
@@ -194,12 +198,18 @@ def _training_seconds(model: Model) -> float:
 def _test_seconds(experiment: Experiment, scene: Scene, model: Model) -> float:
     """What the network's forward passes take here, and a quarter more for all else."""
     policy = DecentralizedPolicy(model.config.policy).eval()
-    fov = torch.zeros(64, scene.num_agents, model.config.policy.channels, 11, 11)
-    graph = torch.zeros(64, scene.num_agents, scene.num_agents)
-    with torch.inference_mode(), autocast(experiment.options.precision, fov.device):
-        each = _seconds(lambda: policy(fov, graph), times=2) / 64
+    bag = _bag(model.config.policy, 64, scene.num_agents)
+    with torch.inference_mode(), autocast(experiment.options.precision, bag.fov.device):
+        each = _seconds(lambda: policy(bag), times=2) / 64
     cases = model.config.test_maps * experiment.cases_per_map(scene)
     return 1.25 * each * cases * STEPS[scene.size] * len(experiment.executions(model, model.trained_for(scene)))
+
+
+def _bag(policy: PolicyConfig, teams: int, num_agents: int) -> Bag:
+    """Return what the robots of some teams perceive at the start, as tensors."""
+    env = BatchedEnv(teams, num_agents=num_agents, **policy.senses())
+    env.reset(0, observe=False)
+    return tensors(env.bag())
 
 
 def _seconds(action: Callable[[], object], times: int = 20) -> float:

@@ -110,11 +110,11 @@ class Model:
                 full.policy,
                 taps=self.taps,
                 comm_range="connected" if self.kind == "connected" else "fixed",
-                cost_to_go=informed,
+                extra_channels=("cost_to_go",) if informed else (),
             ),
             num_agents=N,
             density=0.2 if informed else full.density,  # more corridors, where one robot is in another's way
-            shield="pibt" if informed else "idle",
+            execution=replace(full.execution, shield="pibt" if informed else "idle"),
             **{name: getattr(full, name) * LARGEST // N for name in counts},
         )
 
@@ -178,7 +178,7 @@ class Experiment:
     def executions(self, model: Model, own_size: bool) -> list[Execution]:
         """How a model is executed, on teams of the size it was trained on or of others."""
         names = (*self.options.rows, *(self.options.own_size_rows if own_size else ()))
-        return [Execution.parse(name, model.config.shield) for name in names]
+        return [Execution.parse(name, model.config.execution.shield) for name in names]
 
     def run_of(self, model: Model) -> Path:
         """The run folder of a model."""
@@ -204,7 +204,7 @@ class Experiment:
         Raises:
             FileExistsError: If the run folder holds a model of other settings.
         """
-        metrics, config = (self.run_of(model) / name for name in ("metrics.csv", "config.json"))
+        metrics, config = (self.run_of(model) / name for name in ("metrics.csv", "config.toml"))
         if config.exists():
             model.config.refuse_other(TrainConfig.load(config), f"{self.run_of(model)} holds a model of", "--folder")
         return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.epochs

@@ -219,7 +219,7 @@ def _table(
 def _players(experiment: Experiment, baselines: Sequence[str]) -> list[tuple[str, str, str]]:
     """Who may have been tested on teams of any size: label, player and how it was executed; a star knows the map."""
     models = [
-        (f"{model.name}{'*' if model.config.policy.cost_to_go else ''} {execution.name}", model.name, execution.name)
+        (f"{model.name}{'*' if model.config.policy.needs_map else ''} {execution.name}", model.name, execution.name)
         for model in experiment.models
         if model.general
         for execution in experiment.executions(model, own_size=False)

@@ -61,8 +61,8 @@ class Options:
     methods: tuple[str, ...] = ("pibt", "n12-informed")
     """What to play: "pibt"; "pibt_swap"; "greedy"; "lacam", its first plan within two seconds, or "lacam,SECONDS", its
     plan improved for that long; "rolling", plans of a few steps, or "rolling,ROUNDS", improved for so many rounds; a
-    policy by its name, file or run folder, or with a row of gnn_policy.evaluate, as in "n12-informed,argmax" (stuck
-    robots draw if no row is given, under the shield of the policy's training)."""
+    policy by its name, file or run folder, or with a row of gnn_policy.evaluate, as in "n12-informed,argmax" (executed
+    as its file says if no row is given)."""
     cases: int | None = None
     """Cases to play of each set and team size, spread evenly over all; all of them if not given."""
     published: tuple[str, ...] = ()

@@ -8,27 +8,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 import experts
 from experts import arguments
-from gnn_policy import DecentralizedPolicy, Execution, Rollouts, checkpoint, rollout
-from gnn_policy.execution import STUCK_MEMORY, hears_of, is_stuck, robot_seeds
-from mapf_env import MOVES, BatchedEnv, Instance, Observation, instance_hash
+from gnn_policy import Actor, Execution, checkpoint, rollout
+from gnn_policy.baselines import GreedyActor
+from gnn_policy.rollout import PolicyActor
+from mapf_env import BatchedEnv, Instance, instance_hash
+from mapf_env.config import Shield
 
 FIRST_PLAN_LIMIT = 2.0
 """Seconds that LaCAM may take for a plan where no time is given."""
-LESS_THAN_A_STEP = 0.25
-"""Noise that orders equally close cells; a step of the channel "cost_to_go" is 0.5 in a view of radius 1."""
-
-Choose = Callable[[BatchedEnv, Observation], npt.NDArray[np.float32]]
-"""Values (1, N, 5) of the moves of a team, the greatest wanted most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +65,7 @@ def method_named(words: str) -> Method:
     """
     name, _, options = ("", "", "") if Path(words).exists() else words.partition(",")
     if name in SHIELDS and not options:
-        return _closest_cells(name)
+        return _step_by_step(name, {}, GreedyActor(shield=SHIELDS[name]))
     if name == "lacam":
         return _lacam(words, options)
     if name == "rolling":
@@ -80,97 +75,37 @@ def method_named(words: str) -> Method:
     return _policy(name or words, options)
 
 
-SHIELDS = {"greedy": "idle", "pibt": "pibt", "pibt_swap": "pibt_swap"}
-"""Robots that always want a cell closest to their goal: greedy ones, and those of PIBT (Okumura et al. 2022, 2023)."""
-
-
-def _closest_cells(name: str) -> Method:
-    """Play PIBT or greedy robots in the environment, step by step, so that teams which fail have paths, too."""
-    settings = {"fov_radius": 1, "extra_channels": ("cost_to_go",), "shield": SHIELDS[name]}
-
-    def choose_by(instance: Instance, seed: int) -> Choose:
-        rng = np.random.default_rng(_seeds(instance, seed)[1])
-
-        def choose(venv: BatchedEnv, observation: Observation) -> npt.NDArray[np.float32]:
-            further = observation.fov[:, :, -1, MOVES[:, 0] + 2, MOVES[:, 1] + 2]  # the own cell is (2, 2) of 5 x 5
-            return -(further + LESS_THAN_A_STEP * rng.random(further.shape, np.float32))
-
-        return choose
-
-    def play(instances: Sequence[Instance], max_steps: int, seed: int) -> Played:
-        trips = [drive(each, choose_by(each, seed), settings, max_steps, seed) for each in instances]
-        return judge(instances, [trip.paths for trip in trips], max_steps)
-
-    def serve(instance: Instance, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
-        return drive(instance, choose_by(instance, seed), settings, steps, seed, goals).arrivals
-
-    return Method(name, {}, play, serve)
+SHIELDS: dict[str, Shield] = {"greedy": "idle", "pibt": "pibt", "pibt_swap": "pibt_swap"}
+"""Robots that always want a cell closest to their goal: greedy ones, and those of PIBT (Okumura et al. 2022), also with
+swap (Okumura 2023)."""
 
 
 def _policy(path: str, row: str) -> Method:
-    policy, shield = checkpoint.load(path), checkpoint.trained_with(path).shield
-    execution = Execution.parse(row or "stuck", shield)
-
-    def play(instances: Sequence[Instance], max_steps: int, seed: int) -> Played:
-        return _rollouts(policy, instances, execution, max_steps, seed)
-
-    def serve(instance: Instance, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
-        choose, settings = _choose_by_policy(policy, execution, _seeds(instance, seed)[1])
-        return drive(instance, choose, settings, steps, seed, goals).arrivals
-
+    policy = checkpoint.load(path)
+    execution = Execution.parse(row, policy.execution.shield) if row else policy.execution
     name = f"{Path(path).name.removesuffix('.safetensors')} {execution.name}"
     settings = {"policy": checkpoint.fingerprint(policy), "row": execution.name}
+    return _step_by_step(name, settings, PolicyActor(policy.eval(), execution))
+
+
+def _step_by_step(name: str, settings: Mapping[str, object], actor: Actor) -> Method:
+    """Play by an actor in the environment, so that teams that fail have paths, too."""
+
+    def play(instances: Sequence[Instance], max_steps: int, seed: int) -> Played:
+        played = rollout(actor, instances, seed=seed, max_steps=max_steps)
+        steps = np.array([len(solution.paths) - 1 for solution in played.solutions], np.int64)
+        return Played(played.success, played.on_goal, played.flowtime, played.makespan, steps)
+
+    def serve(instance: Instance, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
+        return arrivals(instance, actor, goals, steps, seed)
+
     return Method(name, settings, play, serve)
 
 
-def _choose_by_policy(policy: DecentralizedPolicy, execution: Execution, seed: int) -> tuple[Choose, dict[str, Any]]:
-    """How a policy chooses in lifelong play, and the settings of the environment in which it does."""
-    config, past = policy.config, list[npt.NDArray[np.int32]]()
-    settings = {
-        "fov_radius": config.fov_radius,
-        "comm_radius": config.comm_radius,
-        "comm_range": execution.comm_range or config.comm_range,
-        "comm_weights": execution.comm_weights or config.comm_weights,
-        "extra_channels": ("cost_to_go",) if config.cost_to_go else (),
-        "shield": execution.shield,
-    }
+def arrivals(instance: Instance, actor: Actor, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
+    """Play one team for that many steps; return how often its robots come to their goals.
 
-    def choose(venv: BatchedEnv, observation: Observation) -> npt.NDArray[np.float32]:
-        positions = venv.positions
-        earlier = np.stack(past[-STUCK_MEMORY:]) if past else np.empty((0, *positions.shape), positions.dtype)
-        with torch.inference_mode():
-            logits = policy(torch.from_numpy(observation.fov), torch.from_numpy(observation.graph)).float().numpy()
-        alarmed = is_stuck(positions, venv.goals, earlier)
-        if config.taps > 1:
-            alarmed |= hears_of(alarmed, observation.graph)
-        seeds = robot_seeds(np.array([seed], np.uint64), venv.num_agents)
-        past.append(positions)
-        return execution.values(logits, alarmed, seeds, len(past) - 1)
-
-    return choose, settings
-
-
-@dataclass(frozen=True, eq=False)
-class Trip:
-    """One team in the environment."""
-
-    paths: npt.NDArray[np.int32]
-    """(steps + 1, N, 2)"""
-    arrivals: int
-    """How often a robot has come to its goal."""
-
-
-def drive(
-    instance: Instance,
-    choose: Choose,
-    settings: Mapping[str, Any],
-    max_steps: int,
-    seed: int,
-    goals: npt.NDArray[np.int32] | None = None,
-) -> Trip:
-    """Play one team in the environment until all are on their goals at once or time is up.
-
-    With `goals` (N, K, 2) the task is lifelong: a robot that arrives gets the next of its K goals.
+    A robot that arrives gets the next of its K `goals` (N, K, 2).
     """
     height, width = instance.grid.shape
     venv = BatchedEnv(
@@ -178,32 +113,26 @@ def drive(
         num_agents=instance.num_agents,
         height=height,
         width=width,
-        max_cycles=max_steps,
-        task="one_shot" if goals is None else "lifelong",
-        **settings,
+        style="empty",
+        max_cycles=steps,
+        task="lifelong",
+        **actor.env_settings(),
     )
-    observation = venv.reset([_seeds(instance, seed)[0]], instances=[instance])
+    venv.reset([_seed(instance, seed)], instances=[instance], observe=False)
     given = np.zeros(instance.num_agents, np.int64)
-    paths = [instance.starts]
-    ended = goals is None and bool(venv.on_goal().all())
-    while not ended:
-        values, current = choose(venv, observation), venv.goals
-        step = venv.step(values.argmax(-1) if venv.config.shield == "idle" else values, observe=False)
-        if goals is not None and step.arrived.any():
-            arrived = np.flatnonzero(step.arrived[0])
+    while venv.running.any():
+        current = venv.goals
+        arrived = np.flatnonzero(venv.step(actor.act(venv), observe=False).arrived[0])
+        if len(arrived):
             current[0, arrived] = goals[arrived, given[arrived]]
             given[arrived] += 1
             venv.assign_goals(current)
-        observation = venv.observe()
-        paths.append(venv.positions[0])
-        ended = bool(step.terminated[0] or step.truncated[0])
-    return Trip(np.stack(paths), int(given.sum()))
+    return int(given.sum())
 
 
-def _seeds(instance: Instance, seed: int) -> tuple[int, int]:
-    """Seeds of the environment and of the robots' draws for one instance, whatever is played beside it."""
-    first, second = np.random.SeedSequence([seed, int(instance_hash(instance)[:16], 16)]).generate_state(2, np.uint64)
-    return int(first), int(second)
+def _seed(instance: Instance, seed: int) -> int:
+    """Return the seed of the environment for one instance, whatever else is played."""
+    return int(np.random.SeedSequence([seed, int(instance_hash(instance)[:16], 16)]).generate_state(1, np.uint64)[0])
 
 
 def _lacam(words: str, options: str) -> Method:
@@ -226,27 +155,36 @@ def _lacam(words: str, options: str) -> Method:
     return Method(words, {"w": str(w), "time_limit": seconds}, play, None)
 
 
+class RollingActor:
+    """The planner with a rolling horizon as the actor of one team."""
+
+    def __init__(self, instance: Instance, rounds: int, seed: int) -> None:
+        self._planner = experts.RollingHorizon(instance.grid, rounds=rounds, seed=_seed(instance, seed))
+
+    def env_settings(self) -> dict[str, object]:
+        """Return the settings of an environment in which robots perceive nothing that costs time."""
+        return {"fov_radius": 1, "comm_radius": 0.0}
+
+    def act(self, env: BatchedEnv) -> npt.NDArray[np.int8]:
+        """Return the planner's joint move (1, N)."""
+        return self._planner.act(env.positions[0], env.goals[0])[None]
+
+
 def _rolling(words: str, options: str) -> Method:
     """Play with a rolling horizon; the option is the number of rounds for each plan."""
     if options and not options.isdecimal():
         raise ValueError(f"the option of rolling is a number of rounds, got {words!r}")
     rounds = int(options) if options else arguments.DEFAULT_WINDOW_ROUNDS
-    settings = {"fov_radius": 1, "shield": "idle"}
-
-    def choose_by(instance: Instance, seed: int) -> Choose:
-        planner = experts.RollingHorizon(instance.grid, rounds=rounds, seed=_seeds(instance, seed)[1])
-
-        def choose(venv: BatchedEnv, observation: Observation) -> npt.NDArray[np.float32]:
-            return np.eye(len(MOVES), dtype=np.float32)[planner.act(venv.positions[0], venv.goals[0])][None]
-
-        return choose
 
     def play(instances: Sequence[Instance], max_steps: int, seed: int) -> Played:
-        trips = [drive(each, choose_by(each, seed), settings, max_steps, seed) for each in instances]
-        return judge(instances, [trip.paths for trip in trips], max_steps)
+        trips = [
+            rollout(RollingActor(each, rounds, seed), [each], seed=seed, max_steps=max_steps).solutions[0].paths
+            for each in instances
+        ]
+        return judge(instances, trips, max_steps)
 
     def serve(instance: Instance, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
-        return drive(instance, choose_by(instance, seed), settings, steps, seed, goals).arrivals
+        return arrivals(instance, RollingActor(instance, rounds, seed), goals, steps, seed)
 
     return Method(words, {"rounds": rounds, "window": arguments.DEFAULT_WINDOW}, play, serve)
 
@@ -266,30 +204,3 @@ def judge(instances: Sequence[Instance], paths: Sequence[npt.NDArray[np.integer]
         rows.append((home == 1.0, home, times.sum(), times.max(), steps))
     columns = zip(*rows, strict=True)
     return Played(*(np.array(column, kind) for column, kind in zip(columns, (bool, float, int, int, int), strict=True)))
-
-
-def _rollouts(
-    policy: DecentralizedPolicy, instances: Sequence[Instance], execution: Execution, max_steps: int, seed: int
-) -> Played:
-    """Play instances of several map sizes, those of one size at a time."""
-    sizes = [instance.grid.shape for instance in instances]
-    groups = [[case for case, size in enumerate(sizes) if size == each] for each in dict.fromkeys(sizes)]
-    parts = [
-        _of_rollouts(
-            rollout(policy, [instances[i] for i in cases], seed=seed, max_steps=max_steps, **asdict(execution))
-        )
-        for cases in groups
-    ]
-    order = np.argsort(np.concatenate(groups))
-    return Played(*(np.concatenate(columns)[order] for columns in zip(*map(_columns, parts), strict=True)))
-
-
-def _columns(played: Played) -> list[npt.NDArray[Any]]:
-    return [getattr(played, each.name) for each in fields(played)]
-
-
-def _of_rollouts(played: Rollouts) -> Played:
-    ends = [solution.paths[-1] for solution in played.solutions]
-    home = [(end == each.goals).all(axis=1).mean() for end, each in zip(ends, played.instances, strict=True)]
-    steps = [len(solution.paths) - 1 for solution in played.solutions]
-    return Played(played.success, np.array(home), played.flowtime, played.makespan, np.array(steps, np.int64))

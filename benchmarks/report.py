@@ -25,6 +25,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gnn_policy.command_line import run_command
+from gnn_policy.config import TrainConfig
 from gnn_policy.failures import MEANINGS
 from mapf_env.files import write_whole
 from paper_experiment import PAPER, TEAMS
@@ -79,8 +80,8 @@ class Run:
         Raises:
             FileNotFoundError: If it is none.
         """
-        if not (folder / "config.json").is_file():
-            raise FileNotFoundError(f"{folder} is no run folder of gnn_policy.train: it has no config.json")
+        if not (folder / "config.toml").is_file():
+            raise FileNotFoundError(f"{folder} is no run folder of gnn_policy.train: it has no config.toml")
         metrics = folder / "metrics.csv"
         home = next((each for each in (folder / "evaluation", folder) if (each / "results.json").is_file()), None)
         page = (home or folder) / "failures.html"
@@ -89,9 +90,9 @@ class Run:
         tested = {str(N): json.loads(file.read_text(encoding="utf-8")) for N, file in tests.items() if file.is_file()}
         return Run(
             folder.name,
-            json.loads((folder / "config.json").read_text(encoding="utf-8"))["num_agents"],
+            TrainConfig.load(folder / "config.toml").num_agents,
             list(csv.DictReader(io.StringIO(metrics.read_text(encoding="utf-8")))) if metrics.is_file() else [],
-            tested or found.get("num_agents", {}),
+            tested or found.get("tables", {}),
             "benchmarks/paper.py: test maps of independent cells, w = 1.05" if tested else _exam(found.get("settings")),
             page.read_text(encoding="utf-8") if page.is_file() else None,
         )

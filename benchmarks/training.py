@@ -33,13 +33,14 @@ from rich.console import Console
 from torch import nn
 from torch.nn.functional import cross_entropy
 
+from gnn_policy.acting import tensors
 from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.convolution import StridedConvolution
 from gnn_policy.network import ENCODERS, DecentralizedPolicy
 from gnn_policy.precision import Precision, autocast
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.training import Training
-from mapf_env import BatchedEnv
+from mapf_env import Bag, BatchedEnv
 
 ROUNDS = 5
 UPDATES = 200
@@ -67,21 +68,36 @@ def median_seconds(action: Callable[[], object], repeats: int = 5, times: int = 
     return float(np.median(taken))
 
 
+def environment(config: TrainConfig, teams: int) -> BatchedEnv:
+    """Teams at their starts, which perceive what the policy reads."""
+    env = BatchedEnv(
+        teams,
+        num_agents=config.num_agents,
+        dtype="uint8",
+        autoreset=AutoresetMode.NEXT_STEP,
+        **config.policy.senses(),
+    )
+    env.reset(0, observe=False)
+    return env
+
+
+def perceived(config: TrainConfig, teams: int) -> Bag:
+    """What the robots of some teams perceive at their starts, as tensors."""
+    return tensors(environment(config, teams).bag())
+
+
 def gradient_step(policy: DecentralizedPolicy, config: TrainConfig) -> Callable[[], None]:
     """A step of the network and the optimiser on one batch that is ready."""
-    B, N, side = config.batch_size, config.num_agents, 2 * config.policy.fov_radius + 3
-    rng = torch.Generator().manual_seed(0)
-    fov = (torch.rand(B, N, config.policy.channels, side, side, generator=rng) < 0.1).to(torch.uint8)
-    graph = (torch.rand(B, N, N, generator=rng) < 0.2).float()
-    labels = torch.randint(5, (B * N,), generator=rng)
+    bag = perceived(config, config.batch_size)
+    labels = torch.randint(5, (len(bag.fov),), generator=torch.Generator().manual_seed(0))
     optimizer = torch.optim.Adam(policy.parameters(), config.lr, weight_decay=config.weight_decay, fused=True)
     policy.train()
 
     def step() -> None:
         with autocast(config.precision, CPU):
-            logits = policy(fov, graph)
+            logits = policy(bag)
         optimizer.zero_grad()
-        cross_entropy(logits.flatten(0, 1).float(), labels).backward()
+        cross_entropy(logits.float(), labels).backward()
         optimizer.step()
 
     return step
@@ -89,25 +105,26 @@ def gradient_step(policy: DecentralizedPolicy, config: TrainConfig) -> Callable[
 
 def forward_pass(policy: DecentralizedPolicy, config: TrainConfig) -> Callable[[], None]:
     """The network's part of a step of all teams of a rollout."""
-    B, N, side = config.rollout_teams, config.num_agents, 2 * config.policy.fov_radius + 3
-    fov, graph = torch.zeros(B, N, config.policy.channels, side, side, dtype=torch.uint8), torch.zeros(B, N, N)
+    bag = perceived(config, config.rollout_teams)
     policy.eval()
 
     def play() -> None:
         with torch.inference_mode(), autocast(config.precision, CPU):
-            policy(fov, graph)
+            policy(bag)
 
     return play
 
 
 def environment_step(config: TrainConfig) -> Callable[[], None]:
     """The environment's part of it."""
-    teams = BatchedEnv(
-        config.rollout_teams, num_agents=config.num_agents, dtype="uint8", autoreset=AutoresetMode.NEXT_STEP
-    )
-    teams.reset(0)
+    teams = environment(config, config.rollout_teams)
     actions = np.random.default_rng(0).integers(0, 5, (config.rollout_teams, config.num_agents))
-    return lambda: teams.step(actions) and None
+
+    def step() -> None:
+        teams.step(actions, observe=False)
+        teams.bag()
+
+    return step
 
 
 def parts_of_a_round() -> None:

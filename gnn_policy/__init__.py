@@ -22,30 +22,31 @@ if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & os.environ.keys():
 if TYPE_CHECKING:
     from gnn_policy.checkpoint import load, save
     from gnn_policy.execution import Execution
-    from gnn_policy.network import DecentralizedPolicy, GraphFilter, shift_operator
+    from gnn_policy.layers import Attention, GraphFilter
+    from gnn_policy.network import DecentralizedPolicy
     from gnn_policy.policy_config import PolicyConfig
     from gnn_policy.robot import Message, Robot
-    from gnn_policy.rollout import Actor, Rollouts, Teams, rollout
+    from gnn_policy.rollout import Actor, Rollouts, rollout
 
 _MODULES = {
     "Actor": "rollout",
+    "Attention": "layers",
     "DecentralizedPolicy": "network",
     "Execution": "execution",
-    "GraphFilter": "network",
+    "GraphFilter": "layers",
     "Message": "robot",
     "PolicyConfig": "policy_config",
     "Robot": "robot",
     "Rollouts": "rollout",
-    "Teams": "rollout",
     "load": "checkpoint",
     "rollout": "rollout",
     "save": "checkpoint",
-    "shift_operator": "network",
 }
 """Each public name and the module that defines it, which is imported when the name is first used."""
 
 __all__ = [
     "Actor",
+    "Attention",
     "DecentralizedPolicy",
     "Execution",
     "GraphFilter",
@@ -53,11 +54,9 @@ __all__ = [
     "PolicyConfig",
     "Robot",
     "Rollouts",
-    "Teams",
     "load",
     "rollout",
     "save",
-    "shift_operator",
 ]
 
 

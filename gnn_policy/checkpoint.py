@@ -1,4 +1,4 @@
-"""Policies on disk: one safetensors file that carries its own configuration. torch is loaded with the weights only."""
+"""Policies on disk: one safetensors file with its configuration and execution; torch comes with the weights only."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import safetensors
 
 from gnn_policy.config import TrainConfig
+from gnn_policy.execution import Execution
 from gnn_policy.policy_config import PolicyConfig
 from mapf_env.files import PathLike, replacing
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from gnn_policy.network import DecentralizedPolicy
 
-FORMAT = "mapf-env policy 1"
+FORMAT = "mapf-env policy 2"
 DUST = 1e-15
 """Saved weights smaller than this are set to zero."""
 WEIGHTS = Path(__file__).with_name("weights")
@@ -57,7 +58,12 @@ def save(policy: DecentralizedPolicy, path: PathLike, **about: str) -> None:
             f"save writes a DecentralizedPolicy, got {type(policy).__name__}: give its state_dict to torch.save"
         )
     require_finite(policy.state_dict())
-    metadata = {**about, "format": FORMAT, "policy": json.dumps(asdict(policy.config))}
+    metadata = {
+        **about,
+        "format": FORMAT,
+        "policy": json.dumps(asdict(policy.config)),
+        "execution": json.dumps(asdict(policy.execution)),
+    }
     weights = {name: _without_dust(tensor).contiguous() for name, tensor in policy.state_dict().items()}
     with replacing(path) as draft:
         draft.write_bytes(_with_sorted_metadata(safetensors.torch.save(weights, metadata)))
@@ -106,7 +112,7 @@ def load(path: PathLike = PACKAGED, *, plugins: Collection[str] = ()) -> Decentr
 
     if isinstance(plugins, str):
         raise TypeError(f"plugins must be a collection of names, got {plugins!r}: write ({plugins!r},)")
-    file, (metadata, shapes) = file_of(path), _read_header(path)
+    file, (metadata, shapes), execution = file_of(path), _read_header(path), executed_as(path)
     try:
         config = PolicyConfig(**_json_object(metadata["policy"]))
     except (KeyError, TypeError, ValueError, RecursionError) as wrong:
@@ -119,7 +125,7 @@ def load(path: PathLike = PACKAGED, *, plugins: Collection[str] = ()) -> Decentr
             )
     try:
         _require_shapes(config, shapes)
-        policy = DecentralizedPolicy(config)
+        policy = DecentralizedPolicy(config, execution)
         policy.load_state_dict(safetensors.torch.load_file(file))
         require_finite(policy.state_dict())
     except safetensors.SafetensorError as damage:
@@ -141,7 +147,7 @@ def _require_shapes(config: PolicyConfig, found: dict[str, tuple[int, ...]]) -> 
 
     from gnn_policy.network import DecentralizedPolicy
 
-    own = tuple(f"{'encoder' if setting == 'encoder' else 'filter'}." for setting in config.plugins)
+    own = tuple(f"{'encoder' if setting == 'encoder' else 'graph_layer'}." for setting in config.plugins)
     built_in = {"encoder": "lean", "graph_layer": "filter"}
     known = replace(config, **{setting: built_in[setting] for setting in config.plugins})
     with torch.device("meta"):
@@ -176,18 +182,35 @@ def trained_with(path: PathLike) -> TrainConfig:
     if settings is None:
         return TrainConfig()
     try:
-        return TrainConfig.from_json(settings, ignore_unknown=True)
+        return TrainConfig.from_toml(settings, ignore_unknown=True)
     except ValueError as wrong:
         raise CheckpointError(f"{file_of(path)}: the settings of its training are damaged: {wrong}") from wrong
 
 
-def trained_under(path: PathLike) -> str:
-    """Return the shield of the training of the policy at `path`, "idle" if it does not say; raises as `about` does."""
-    settings = about(path).get("training")
+def config_of(path: PathLike) -> PolicyConfig:
+    """Return the configuration of the policy at `path`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        CheckpointError: If the file is damaged or comes from another program.
+    """
     try:
-        return TrainConfig().shield if settings is None else _json_object(settings)["shield"]
+        return PolicyConfig(**_json_object(about(path)["policy"]))
     except (KeyError, TypeError, ValueError, RecursionError) as wrong:
-        raise CheckpointError(f"{file_of(path)}: the settings of its training are damaged: {wrong}") from wrong
+        raise CheckpointError(f"{file_of(path)}: its configuration is damaged: {wrong}") from wrong
+
+
+def executed_as(path: PathLike) -> Execution:
+    """Return how the policy at `path` is executed unless a caller says otherwise.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        CheckpointError: If the file is damaged or comes from another program.
+    """
+    try:
+        return Execution(**_json_object(about(path)["execution"]))
+    except (KeyError, TypeError, ValueError, RecursionError) as wrong:
+        raise _misfit(file_of(path), wrong, "how to execute the policy is not readable") from wrong
 
 
 def fingerprint(policy: DecentralizedPolicy) -> str:
@@ -236,9 +259,11 @@ def _json_object(text: str) -> dict[str, Any]:
     return found
 
 
-def _misfit(file: Path, mismatch: Exception) -> CheckpointError:
+def _misfit(
+    file: Path, mismatch: Exception, what: str = "the weights do not fit their configuration"
+) -> CheckpointError:
     why = " ".join(f"{type(mismatch).__name__}: {mismatch}".split())
-    return CheckpointError(f"the weights in {file} do not fit their configuration ({why})")
+    return CheckpointError(f"{file}: {what} ({why})")
 
 
 def _damaged(file: Path, damage: Exception) -> CheckpointError:

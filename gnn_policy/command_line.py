@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -74,13 +75,20 @@ def _one_line(error: Exception) -> str:
 
 
 def on_device(policy: DecentralizedPolicy, device: str) -> DecentralizedPolicy:
-    """Move the policy to a device of PyTorch's, such as "cuda".
+    """Move the policy to a device of PyTorch's, such as "cuda"; "auto" is the fastest that there is.
+
+    Under torchrun each process takes the GPU of its number on the machine (LOCAL_RANK).
 
     Raises:
         ValueError: If there is no such device, or it holds no numbers, as "meta".
     """
     import torch
 
+    if device == "auto":
+        accelerator = torch.accelerator.current_accelerator(check_available=True)
+        device = "cpu" if accelerator is None else accelerator.type
+    if device == "cuda":
+        device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
     try:
         torch.ones(1, device=device).cpu()
         return policy.to(device)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
+import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from gnn_policy.cases import Split
-from gnn_policy.execution import Shield
+import tomli_w
+
+from gnn_policy.cases import Cases, Family, Split, Task, cases_of_files, make_cases
+from gnn_policy.execution import Execution, Sample
 from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.settings import check_types
 from mapf_env.arguments import share
@@ -18,7 +20,7 @@ from mapf_env.generation import MapStyle
 
 Recipe = Literal["quick", "full", "paper"]
 RobotOrder = Literal["index", "random", "farthest", "nearest"]
-Aggregation = Literal["visited", "stuck"]
+Aggregation = Literal["visited", "stuck", "plans"]
 Backend = Literal["direct", "process"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -29,6 +31,9 @@ class TrainConfig:
 
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     """The network and what it perceives."""
+    init: str | None = None
+    """Start from the weights of a policy: a run folder, a .safetensors file, or the name of a packaged policy. The
+    network, its senses and its execution are then that policy's. Random weights if not given."""
 
     num_agents: int = 10
     """Robots N in a training team."""
@@ -39,8 +44,16 @@ class TrainConfig:
     density: float = 0.1
     """Share of obstacles on a map."""
     styles: tuple[MapStyle, ...] = ("cells",)
-    """Obstacles: independent "cells", short "walls" as the paper's released generator makes them, or "maze", "room",
-    "warehouse" and "empty", which heed no density; the maps of a split take turns among the styles."""
+    """Obstacles: independent "cells", short "walls" as the authors' generator makes them, or "maze", "room",
+    "warehouse" and "empty", which ignore the density; the maps of a split take turns among the styles."""
+    task: Task = "one_shot"
+    """"lifelong": a robot that arrives gets a new goal, and validation and evaluation measure throughput."""
+    families: tuple[Family, ...] = ()
+    """Families of random cases with ranges of sizes, densities and team sizes, instead of the five settings above; in a
+    configuration file, one [[families]] table for each."""
+    files: tuple[str, ...] = ()
+    """Your own maps (.map), scenarios (.scen) and sets of instances (.json), or folders of them, instead of random
+    maps. The splits share no map if there are three or more; otherwise they share maps, but no starts and goals."""
     train_maps: int = 420
     """Maps for training."""
     validation_maps: int = 90
@@ -75,8 +88,10 @@ class TrainConfig:
     demonstration_steps: int = 524_288
     """Team steps played in round 0, by the expert."""
     aggregation: Aggregation = "visited"
-    """What is aggregated: every "visited" state, or plans from where teams are "stuck" at the end of their time, as the
-    released code does."""
+    """What is aggregated: every "visited" state; plans from where teams are "stuck" at the end of their time, as the
+    authors' code does; or the first steps of "plans" from some of the visited states, which costs the expert least."""
+    plan_steps: int = 24
+    """Steps of each plan that are labelled in an aggregation of "plans"."""
     dagger_every: int = 4
     """Rounds from one aggregation to the next; 0 for plain imitation."""
     dagger_steps: int = 32_768
@@ -97,11 +112,12 @@ class TrainConfig:
     """How many of them share a process's rollout_teams; each has a seed of its own."""
     hard_case_mining: int = 1
     """Team steps played for each one that is labelled; teams that did not arrive in the round are labelled first."""
-    shield: Shield = "idle"
-    """Under which aggregated rollouts and validation play: the paper's "idle", or "pibt", which takes the logits as
-    preferences."""
-    sample_rollouts: bool = False
-    """Draw the moves of aggregated rollouts from the softmax in place of the most probable ones."""
+    execution: Execution = Execution(sample="stuck")
+    """How the policy is executed; saved with the weights. Rollouts in training and validation play in the same way,
+    except for what `sample_rollouts` says."""
+    sample_rollouts: Sample = False
+    """Which moves of rollouts in training and validation are drawn from the softmax: those of no robot, of all robots,
+    or of robots that are "stuck"."""
     augment: bool = False
     """Turn and reflect every demonstrated state at random."""
 
@@ -125,15 +141,15 @@ class TrainConfig:
     precision: Precision = "auto"
     """In which numbers the network computes in training: "bfloat16", "float32", or "auto", the first where the
     hardware has it."""
-    device: str = "cpu"
-    """Where the network lives."""
+    device: str = "auto"
+    """Where the network computes: "cpu", "cuda", "mps", or "auto", the fastest that there is."""
 
     def __post_init__(self) -> None:
         check_types(self)
         positive = (
             "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
             "expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
-            "rollout_teams hard_case_mining collectors lr final_lr validate_every"
+            "rollout_teams plan_steps hard_case_mining collectors lr final_lr validate_every"
         )
         for name in positive.split():
             if not 0 < getattr(self, name) < math.inf:
@@ -154,6 +170,38 @@ class TrainConfig:
             raise ValueError(f"w must be at least 1 and finite, got {self.w}")
         if self.updates_per_epoch is not None and self.updates_per_epoch < 1:
             raise ValueError(f"updates_per_epoch must be at least 1, got {self.updates_per_epoch}")
+
+    @property
+    def rollout_execution(self) -> Execution:
+        """How teams play in training and validation."""
+        return replace(self.execution, sample=self.sample_rollouts)
+
+    @property
+    def case_families(self) -> tuple[Family, ...]:
+        """The families of random cases."""
+        alike = Family(
+            height=(self.height, self.height),
+            width=(self.width, self.width),
+            density=(self.density, self.density),
+            num_agents=(self.num_agents, self.num_agents),
+        )
+        return self.families or tuple(replace(alike, style=style) for style in self.styles)
+
+    def cases(self, split: Split) -> Cases:
+        """Return the cases of a split.
+
+        Raises:
+            ValueError: If there is no room for the robots, or a file does not fit.
+            OSError: If a file cannot be read.
+        """
+        maps, cases_per_map = self.size_of(split)
+        if self.files:
+            return cases_of_files(
+                split, self.files, seed=self.data_seed, cases_per_map=cases_per_map, num_agents=self.num_agents
+            )
+        return make_cases(
+            split, seed=self.data_seed, maps=maps, cases_per_map=cases_per_map, families=self.case_families
+        )
 
     def size_of(self, split: Split) -> tuple[int, int]:
         """The number of maps of a split, and of cases on each."""
@@ -180,24 +228,24 @@ class TrainConfig:
             raise FileExistsError(f"{what} other settings ({', '.join(differ)}): choose another folder with {option}")
 
     def save(self, path: Path) -> None:
-        """Write the settings as JSON."""
-        write_whole(path, self.to_json())
+        """Write the settings as TOML."""
+        write_whole(path, self.to_toml())
 
     @staticmethod
     def load(path: Path) -> TrainConfig:
-        """Read what `save` wrote.
+        """Read what `save` wrote, or a user wrote; settings that are not there have their defaults.
 
         Raises:
             ValueError: If the file is damaged or has settings that this version does not know.
         """
         try:
-            return TrainConfig.from_json(path.read_text(encoding="utf-8"))
+            return TrainConfig.from_toml(path.read_text(encoding="utf-8"))
         except ValueError as damage:
             raise ValueError(f"{path}: {damage}") from damage
 
     @staticmethod
-    def from_json(text: str, *, ignore_unknown: bool = False) -> TrainConfig:
-        """Return the settings that `to_json` wrote.
+    def from_toml(text: str, *, ignore_unknown: bool = False) -> TrainConfig:
+        """Return the settings that `to_toml` wrote.
 
         Args:
             text: The settings.
@@ -208,24 +256,38 @@ class TrainConfig:
                 and not left out.
         """
         try:
-            settings = _table(json.loads(text), TrainConfig, ignore_unknown)
-            policy = PolicyConfig(**_table(settings.pop("policy"), PolicyConfig, ignore_unknown))
-            styles = settings.pop("styles")
-            return TrainConfig(policy=policy, styles=tuple(styles) if isinstance(styles, list) else styles, **settings)
+            settings = _settings(tomllib.loads(text), TrainConfig, ignore_unknown)
+            defaults = TrainConfig()
+            for name, default in (("policy", defaults.policy), ("execution", defaults.execution)):
+                if name in settings:
+                    settings[name] = replace(default, **_settings(settings[name], type(default), ignore_unknown))
+            if "families" in settings:
+                settings["families"] = tuple(
+                    Family(**_settings(each, Family, ignore_unknown)) for each in settings["families"]
+                )
+            return TrainConfig(**settings)
         except (ValueError, KeyError, TypeError, RecursionError) as damage:
-            raise ValueError(f"no settings of this version of mapf-env ({damage})") from damage
+            raise ValueError(f"not the settings of a training of this version of mapf-env ({damage})") from damage
 
-    def to_json(self) -> str:
-        """The settings as text."""
-        return json.dumps(asdict(self), indent=2) + "\n"
+    def to_toml(self) -> str:
+        """Return the settings as text; `None` is the default of every setting that can have it, and is left out."""
+        return tomli_w.dumps(_written(asdict(self)))
 
 
-def _table(found: Any, kind: type, ignore_unknown: bool) -> dict[str, Any]:
-    """Return a JSON object as arguments of a dataclass."""
+def _settings(found: Any, kind: type, ignore_unknown: bool) -> dict[str, Any]:
+    """Return a table as arguments of a dataclass, its arrays as tuples."""
     if not isinstance(found, dict):
-        raise TypeError(f"expected an object of settings, got {type(found).__name__}")
+        raise TypeError(f"expected a table of settings, got {type(found).__name__}")
     known = {each.name for each in fields(kind)}
-    return {name: value for name, value in found.items() if name in known or not ignore_unknown}
+    if not ignore_unknown and (strange := found.keys() - known):
+        raise ValueError(f"there is no setting {min(strange)!r}: the settings are {', '.join(sorted(known))}")
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in found.items() if name in known}
+
+
+def _written(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _written(each) for name, each in value.items() if each is not None}
+    return [_written(each) for each in value] if isinstance(value, tuple | list) else value
 
 
 _QUICK = TrainConfig(

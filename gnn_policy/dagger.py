@@ -8,9 +8,8 @@ that of the paper's released code.
 from __future__ import annotations
 
 import functools
-import math
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,173 +17,37 @@ import numpy.typing as npt
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch.nn.functional import one_hot
 from torchrl.collectors import BaseCollector, Collector
 
-import experts
-from experts.many import SOLVER_NAMES
-from gnn_policy.config import Backend, RobotOrder, TrainConfig
+from gnn_policy.acting import scores_of
+from gnn_policy.cases import Cases
+from gnn_policy.config import Backend, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
-from gnn_policy.finite import require_finite
+from gnn_policy.execution import gumbel, robot_seeds
 from gnn_policy.network import DecentralizedPolicy
-from gnn_policy.plugins import import_by_name
 from gnn_policy.precision import autocast
 from gnn_policy.ranks import Ranks
-from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
-from mapf_env import Action, Instance, Solution, _native
-
-
-class Teacher:
-    """The expert, as training asks it: for the joint move in each of many states of known cases, or for its plan there.
-
-    Args:
-        instances: The training cases.
-        solver: The expert: one of the solvers that `experts.solve_many` knows by name, or "module:function".
-        w: ECBS's bound on suboptimality; other solvers are asked without one.
-        robot_order: In which order it is given the robots of a state; it breaks ties by that.
-        node_limit: ECBS's and LaCAM's effort for a state.
-        threads: CPU threads.
-        clock: What `seconds` are measured by.
-
-    Raises:
-        ValueError: If there is no such solver.
-    """
-
-    def __init__(
-        self,
-        instances: Sequence[Instance],
-        *,
-        solver: str = "ecbs",
-        w: float,
-        robot_order: RobotOrder = "index",
-        node_limit: int,
-        threads: int,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._instances, self._w, self._robot_order = instances, w, robot_order
-        self._node_limit, self._threads, self._clock = node_limit, threads, clock
-        self._solver = solver if solver in SOLVER_NAMES else import_by_name(solver, "the teacher", SOLVER_NAMES)
-        self._goals = np.stack([each.goals for each in instances])
-        self.seconds = 0.0
-        """Time that it has taken to answer, so far."""
-
-    def moves(
-        self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]
-    ) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
-        """Joint moves (M, N) in M states (M, N, 2) of the given cases (M,), and which of them the expert solved."""
-        if self._solver != "ecbs":
-            plans = self.plans(cases, positions)
-            moves = np.full(positions.shape[:2], Action.IDLE, np.int8)
-            for state, plan in enumerate(plans):
-                if plan is not None and len(plan.paths) > 1:
-                    moves[state] = Solution(plan.paths[:2]).actions[0]
-            return moves, np.array([plan is not None for plan in plans], np.bool_)
-        began = self._clock()
-        order = self._order(cases, positions)
-        instances = [self._instances[i] for i in cases]
-        if self._robot_order != "index":
-            instances, positions = self._ordered(cases, positions, order), _rows(positions, order)
-        moves, solved = experts.relabel(
-            instances, positions, w=self._w, node_limit=self._node_limit, threads=self._threads
-        )
-        moves = _rows(moves, order.argsort(axis=1))
-        self.seconds += self._clock() - began
-        return moves, solved
-
-    def plans(self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]) -> list[Solution | None]:
-        """The plan from each of M states, or None where the expert found none."""
-        began = self._clock()
-        order = self._order(cases, positions)
-        results = experts.solve_many(
-            self._ordered(cases, positions, order),
-            solver=self._solver,
-            w=self._w if self._solver == "ecbs" else None,
-            threads=self._threads,
-            time_limit=math.inf,
-            node_limit=self._node_limit,
-        )
-        plans = [
-            None if result.solution is None else Solution(result.solution.paths[:, back])
-            for result, back in zip(results, order.argsort(axis=1), strict=True)
-        ]
-        self.seconds += self._clock() - began
-        return plans
-
-    def _order(self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]) -> npt.NDArray[np.intp]:
-        """(M, N) the robots of each state in the order in which the expert is given them, a function of the state."""
-        M, N = positions.shape[:2]
-        if self._robot_order == "index":
-            return np.tile(np.arange(N), (M, 1))
-        if self._robot_order == "random":
-            state = cases.astype(np.uint64)
-            for coordinates in positions.reshape(M, -1).T.astype(np.uint64):
-                state = _native.mix(state, np.ascontiguousarray(coordinates))
-            robots = np.tile(np.arange(N, dtype=np.uint64), M)
-            return _native.mix(np.repeat(state, N), robots).reshape(M, N).argsort(axis=1)
-        distances = np.abs(positions.astype(np.int64) - self._goals[cases]).sum(axis=2)
-        return (distances if self._robot_order == "nearest" else -distances).argsort(axis=1, kind="stable")
-
-    def _ordered(
-        self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer], order: npt.NDArray[np.intp]
-    ) -> list[Instance]:
-        return [
-            Instance(self._instances[case].grid, state[robots], self._goals[case][robots])
-            for case, state, robots in zip(cases, positions, order, strict=True)
-        ]
-
-    def demonstrate(
-        self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]
-    ) -> tuple[Demonstrations, int]:
-        """Demonstrations of all states on the plans from the given ones, and how many the expert could not solve."""
-        N, unsolved = positions.shape[1], 0
-        parts = [Demonstrations(np.empty(0, np.int32), np.empty((0, N, 2), np.int16), np.empty((0, N), np.int8))]
-        for case, plan in zip(cases, self.plans(cases, positions), strict=True):
-            if plan is None:
-                unsolved += 1
-                continue
-            steps = plan.makespan
-            parts.append(
-                Demonstrations(
-                    np.full(steps, case, np.int32), plan.paths[:steps].astype(np.int16), plan.actions[:steps]
-                )
-            )
-        return Demonstrations.concatenate(parts), unsolved
-
-    def label(self, cases: npt.NDArray[np.integer], positions: npt.NDArray[np.integer]) -> tuple[Demonstrations, int]:
-        """Demonstrations of the given states, in their order, and how many the expert could not solve.
-
-        A state that was visited often counts as often, so states where teams are stuck weigh more; it is solved once.
-        """
-        rows = np.column_stack([cases, positions.reshape(len(cases), -1)]).astype(np.int32)
-        _, first, which = np.unique(
-            rows.view(np.dtype((np.void, rows.strides[0]))).ravel(), return_index=True, return_inverse=True
-        )
-        actions, solved = self.moves(cases[first], positions[first])
-        actions, solved = actions[which], solved[which]
-        labelled = Demonstrations(
-            cases[solved].astype(np.int32), positions[solved].astype(np.int16), actions[solved].astype(np.int8)
-        )
-        return labelled, int((~solved).sum())
-
-
-def _rows(array: npt.NDArray[Any], order: npt.NDArray[np.intp]) -> npt.NDArray[Any]:
-    """(M, N, ...) with the N entries of each row in its own order (M, N)."""
-    return array[np.arange(len(array))[:, None], order]
+from gnn_policy.teacher import Teacher
+from gnn_policy.team_env import ACTION, CASE, POSITIONS, STATE_KEYS, TeamEnv, states_of
+from mapf_env import Action, MapSet, States, perceive
 
 
 class Mixture(TensorDictModuleBase):
     """In each step a team follows the expert with probability `beta`, else the policy.
 
-    Under the shield "pibt" an action is a value for each move: the policy's logits, or 1 for the expert's move.
+    Under a PIBT shield an action is a score for each move: the policy's, or 1 for the expert's move.
     """
 
     beta: torch.Tensor
     seed: torch.Tensor
 
-    def __init__(self, policy: DecentralizedPolicy, teacher: Teacher, config: TrainConfig) -> None:
+    def __init__(self, policy: DecentralizedPolicy, teacher: Teacher, config: TrainConfig, cases: Cases) -> None:
         super().__init__()
         self.policy, self.teacher, self.config = policy, teacher, config
-        self.in_keys = [FOV, GRAPH, POSITIONS, CASE]  # pyright: ignore[reportAttributeAccessIssue]
+        self._map_of = cases.map_of
+        self._senses = config.rollout_execution.senses(config.policy)
+        self._maps = MapSet(cases.grids, self._senses.fov_radius, "uint8")
+        self.in_keys = list(STATE_KEYS)  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = [ACTION]  # pyright: ignore[reportAttributeAccessIssue]
         # Buffers, so that they reach a collector's processes together with the weights.
         self.register_buffer("beta", torch.ones(()))
@@ -199,25 +62,41 @@ class Mixture(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the joint actions (B, N)."""
-        teams, cases = tensordict.batch_size[0], tensordict[CASE]
+        """Write the joint actions (B, N), or scores (B, N, 5)."""
+        count, cases = tensordict.batch_size[0], tensordict[CASE]
         if self._seeded != int(self.seed):
             self._seeded = int(self.seed)
             self._random.manual_seed(self._seeded + int(cases.sum()))  # collectors side by side play other cases
-        by_expert = torch.rand(teams, generator=self._random) < self.beta.cpu()
-        positions = tensordict[POSITIONS]
-        values = torch.empty(*positions.shape[:2], len(Action))
+        by_expert = (torch.rand(count, generator=self._random) < self.beta.cpu()).numpy()
+        states = states_of(tensordict, self._map_of)
+        scores = np.zeros((states.num_robots, len(Action)), np.float32)
+        taught = by_expert[states.team]
         if not by_expert.all():
-            device = self.policy.head.weight.device
-            with autocast(self.config.precision, device):
-                values = self.policy(tensordict[FOV].to(device), tensordict[GRAPH].to(device)).float().cpu()
-            require_finite({"logits": values}, "the network's logits")
-            if self.config.sample_rollouts:  # the greatest of the logits with Gumbel noise is a draw from the softmax
-                values -= torch.empty_like(values).exponential_(generator=self._random).log()
+            scores[~taught] = self._score(states.take(~by_expert))
         if by_expert.any():
-            moves, _ = self.teacher.moves(np.asarray(cases[by_expert]), np.asarray(positions[by_expert]))
-            values[by_expert] = one_hot(torch.from_numpy(moves.astype(np.int64)), len(Action)).float()
-        return tensordict.set(ACTION, values if self.config.shield == "pibt" else values.argmax(-1))
+            moves, _ = self.teacher.moves(states.take(by_expert))
+            scores[taught] = np.eye(len(Action), dtype=np.float32)[moves]
+        sizes = np.diff(states.offsets)
+        present = np.arange(tensordict[POSITIONS].shape[1]) < sizes[:, None]
+        action = np.zeros((*present.shape, len(Action)), np.float32)
+        action[present] = scores
+        if self.config.rollout_execution.shield != "idle":
+            return tensordict.set(ACTION, torch.from_numpy(action))
+        chosen = action.argmax(-1)
+        chosen[~present] = Action.IDLE
+        return tensordict.set(ACTION, torch.from_numpy(chosen))
+
+    def _score(self, states: States) -> npt.NDArray[np.float32]:
+        maps = self._maps.index[states.maps]
+        bag = perceive(replace(states, maps=maps), self._maps, self._senses)
+        team = states.team
+        robot = np.arange(states.num_robots) - states.offsets[team]
+
+        def noise(drawn: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
+            return gumbel(robot_seeds(states.seeds[team[drawn]], robot[drawn]), states.times[team[drawn]])
+
+        with autocast(self.config.precision, self.policy.head.weight.device):
+            return scores_of(self.policy, bag, self.config.rollout_execution, noise)
 
 
 def _collector(
@@ -246,7 +125,7 @@ def teams_side_by_side(config: TrainConfig, ranks: Ranks) -> int:
     return teams
 
 
-class Aggregator:
+class Demonstrator:
     """Collects demonstrations round by round through a TorchRL collector."""
 
     def __init__(
@@ -254,25 +133,23 @@ class Aggregator:
         config: TrainConfig,
         policy: DecentralizedPolicy,
         teacher: Teacher,
-        instances: Sequence[Instance],
+        cases: Cases,
         ranks: Ranks = Ranks(),
     ) -> None:
-        self._config, self._teacher, self._rank = config, teacher, ranks.rank
+        self._config, self._teacher, self._cases, self._map_of = config, teacher, cases, cases.map_of
+        self._rank, self._ranks = ranks.rank, ranks.count
         teams, players = teams_side_by_side(config, ranks), config.collectors
-        self._mixture = Mixture(policy, teacher, config)
+        self._mixture = Mixture(policy, teacher, config, cases)
         self._mixture.begin(beta=1.0, seed=0)
         make_env = functools.partial(
             TeamEnv,
             teams // players,
-            instances,
-            fov_radius=config.policy.fov_radius,
-            extra_channels=("cost_to_go",) if config.policy.cost_to_go else (),
-            comm_radius=config.policy.comm_radius,
-            comm_range=config.policy.comm_range,
-            comm_weights=config.policy.comm_weights,
-            shield=config.shield,
+            cases.instances,
+            observation="state",
+            task=config.task,
             max_cycles=config.rollout_length,
             dtype="uint8",
+            **config.rollout_execution.env_settings(config.policy),
         )
         self._collector = _collector(
             config.backend,
@@ -288,32 +165,51 @@ class Aggregator:
     def collect(self, round_number: int, steps: int) -> tuple[Demonstrations, int]:
         """Play this process's share of at least `steps` team steps and label them.
 
-        What a round yields depends on its number, the process's and the weights.
+        The demonstrations of a round depend on its number, the process's number and the weights.
 
         Returns:
             The demonstrations of all states of the round, or of plans from where teams were stuck, and the number of
             states that the expert could not solve.
         """
         seed = int(np.random.SeedSequence([self._config.seed, round_number, self._rank]).generate_state(1)[0])
+        if round_number == 0 and self._config.aggregation == "plans":
+            return self._teacher.demonstrate(self._starts(steps, np.random.default_rng(seed)))
         self._mixture.begin(self._config.beta_decay**round_number, seed)
         if self._config.backend != "direct":
             self._collector.update_policy_weights_(self._mixture)
         self._collector.set_seed(seed)
         config, demonstrated = self._config, round_number == 0
-        stuck_only = config.aggregation == "stuck" and not demonstrated
+        aggregation = "visited" if demonstrated else config.aggregation
         mining = 1 if demonstrated else config.hard_case_mining
-        keys = (CASE, POSITIONS, ("next", "truncated"), ("next", "terminated"))
-        seen: list[list[npt.NDArray[Any]]] = [[] for _ in keys]
+        parts: list[TensorDictBase] = []
         for _ in range(mining * -(-steps // (config.rollout_teams * config.rollout_length))):
             visited = next(self._batches).reshape(-1, config.rollout_length)  # collectors side by side are stacked
-            for key, found in zip(keys, seen, strict=True):
-                found.append(np.asarray(visited[key]).copy())
-        cases, positions, truncated, terminated = map(np.concatenate, seen)
-        arrived = terminated.reshape(len(terminated), -1).any(axis=1)
-        teams = np.sort(arrived.argsort(kind="stable")[: len(terminated) // mining])
-        asked = truncated[teams, :, 0] if stuck_only else np.ones(cases[teams].shape, np.bool_)
-        ask = self._teacher.demonstrate if stuck_only else self._teacher.label
-        return ask(cases[teams][asked], positions[teams][asked])
+            parts.append(visited.select(*STATE_KEYS, ("next", "truncated"), ("next", "terminated")).clone())
+        played: Any = torch.cat(parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        arrived = np.asarray(played["next", "terminated"]).reshape(len(played), -1).any(axis=1)
+        teams = np.sort(arrived.argsort(kind="stable")[: len(played) // mining])
+        chosen = played[torch.from_numpy(teams)].reshape(-1)
+        if aggregation == "stuck":
+            chosen = chosen[chosen["next", "truncated"][:, 0]]
+            return self._teacher.demonstrate(states_of(chosen, self._map_of))
+        if aggregation == "plans":
+            rng = np.random.default_rng(seed)
+            asked = rng.permutation(len(chosen))[: max(len(chosen) // config.plan_steps, 1)]
+            states = states_of(chosen[torch.from_numpy(np.sort(asked))], self._map_of)
+            return self._teacher.demonstrate(states, config.plan_steps)
+        return self._teacher.label(states_of(chosen, self._map_of))
+
+    def _starts(self, steps: int, rng: np.random.Generator) -> States:
+        """Return the starts of as many cases as have plans of about so many steps."""
+        config, count = self._config, max(steps // self._config.plan_steps // self._ranks, 1)
+        chosen = rng.integers(len(self._cases), size=count)
+        return States.start_of(
+            [self._cases.instances[case] for case in chosen],
+            config.policy,
+            maps=self._map_of[chosen],
+            seeds=rng.integers(2**63, size=count).astype(np.uint64),
+            limits=config.rollout_length,
+        )
 
     def close(self) -> None:
         """Shut the collector down."""

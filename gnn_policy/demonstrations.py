@@ -1,9 +1,10 @@
-"""What the expert would do in the states that were visited: positions and moves, never observations."""
+"""What the expert would do in the states that were visited: states and moves, never observations."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -14,43 +15,42 @@ import torch
 from tensordict import TensorDict
 
 from gnn_policy import symmetry
-from gnn_policy.perception import Perception
-from gnn_policy.policy_config import PolicyConfig
-from gnn_policy.team_env import FOV, GRAPH
-from mapf_env import Instance, rules
+from gnn_policy.acting import tensors
+from gnn_policy.imitation import EXPERT_ACTION
+from mapf_env import MapSet, Senses, States, perceive
 from mapf_env.files import replacing
 
-EXPERT_ACTION = ("agents", "expert_action")
+LEAST = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demonstrations:
-    """M labelled states of the training cases: 5 N + 4 bytes each."""
+    """M labelled states of teams of any sizes, R robots in all."""
 
-    cases: npt.NDArray[np.int32]
-    """(M,) which case a state belongs to."""
-    positions: npt.NDArray[np.int16]
-    """(M, N, 2) where the robots stand."""
+    states: States
+    """The M states, their maps numbered as the training maps are."""
     actions: npt.NDArray[np.int8]
-    """(M, N) what the expert does there."""
+    """(R,) the expert's move of each robot."""
 
     def __len__(self) -> int:
-        return len(self.cases)
+        return len(self.states)
 
     @staticmethod
     def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
-        """All states of `parts`, in order."""
+        """Return all states of `parts`, in order."""
         return Demonstrations(
-            np.concatenate([part.cases for part in parts]),
-            np.concatenate([part.positions for part in parts]),
-            np.concatenate([part.actions for part in parts]),
+            States.concatenate([part.states for part in parts]), np.concatenate([part.actions for part in parts])
         )
+
+    def take(self, chosen: npt.NDArray[np.integer]) -> Demonstrations:
+        """Return the chosen states (B,), in that order."""
+        return Demonstrations(self.states.take(chosen), self.actions[self.states.rows(chosen)])
 
     def save(self, path: Path) -> None:
         """Write one file, as a whole or not at all."""
-        arrays = {"cases": self.cases, "positions": self.positions, "actions": self.actions}
+        arrays = {each.name: getattr(self.states, each.name) for each in fields(States)}
         with replacing(path) as draft:
-            draft.write_bytes(safetensors.numpy.save(arrays))
+            draft.write_bytes(safetensors.numpy.save({**arrays, "actions": self.actions}))
 
     @staticmethod
     def load(path: Path) -> Demonstrations:
@@ -60,46 +60,82 @@ class Demonstrations:
             ValueError: If the file is damaged.
         """
         try:
-            return Demonstrations(**safetensors.numpy.load_file(path))
-        except (safetensors.SafetensorError, TypeError) as damage:
-            raise ValueError(f"{path} is damaged ({damage}): delete the run folder and train anew") from None
+            arrays = safetensors.numpy.load_file(path)
+            actions = arrays.pop("actions")
+            return Demonstrations(States(**arrays), actions)
+        except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as damage:
+            raise ValueError(f"{path} is damaged ({damage}): delete the run folder and train again") from None
 
 
 class BatchMaker:
-    """Rebuilds what robots observe in demonstrated states, under random symmetries of the world.
+    """Rebuilds what robots perceive in demonstrated states, under random symmetries of the world.
 
     Args:
-        instances: The training cases, all of one size.
-        config: What the policy perceives.
+        grids: The training maps.
+        senses: What the policy's robots perceive.
         augment: Turn and reflect every state at random.
+        threads: CPU threads.
     """
 
-    def __init__(self, instances: Sequence[Instance], config: PolicyConfig, *, augment: bool) -> None:
-        self._perception = Perception(config, instances)
-        self._height, self._width = instances[0].grid.shape
-        self._symmetries = symmetry.symmetries(self._height, self._width) if augment else np.array([0])
-        known: dict[bytes, int] = {}
-        self._map_of_case = np.array([known.setdefault(each.grid.tobytes(), len(known)) for each in instances])
-        grids = np.frombuffer(b"".join(known), np.bool_).reshape(-1, self._height, self._width)
-        self._goals = np.stack([each.goals for each in instances])
-        self._obstacles = np.stack(
-            [rules.bordered(symmetry.turn_maps(grids, g), config.fov_radius, np.uint8) for g in self._symmetries]
-        )
+    def __init__(
+        self, grids: Sequence[npt.NDArray[np.bool_]], senses: Senses, *, augment: bool, threads: int = 1
+    ) -> None:
+        self._senses, self._threads = senses, threads
+        self._symmetries = 8 if augment else 1
+        self._shapes = np.array([grid.shape for grid in grids])
+        turned = [symmetry.turn_map(grid, g) for grid in grids for g in range(self._symmetries)]
+        self._maps = MapSet(turned, senses.fov_radius, "uint8")
 
     def batch(
         self, demonstrations: Demonstrations, chosen: npt.NDArray[np.integer], rng: np.random.Generator
     ) -> TensorDict:
-        """Views, graphs and labels of the chosen states (B,), each under a symmetry drawn by `rng`."""
-        cases = demonstrations.cases[chosen]
-        choice = rng.integers(len(self._symmetries), size=len(chosen))
-        turn = self._symmetries[choice]
-        goals = self._turn(self._goals[cases], turn)
-        positions = self._turn(demonstrations.positions[chosen], turn)
-        obstacles = self._obstacles[choice, self._map_of_case[cases]]
-        fov, graph = self._perception.observe(cases, obstacles, positions, goals)
-        labels = symmetry.ACTIONS[turn[:, None], demonstrations.actions[chosen]].astype(np.int64)
-        tensors = {key: torch.from_numpy(array) for key, array in ((FOV, fov), (GRAPH, graph), (EXPERT_ACTION, labels))}
-        return TensorDict(tensors, batch_size=[len(chosen)])
+        """Return what `ImitationLoss` reads: the bag of the chosen states (B,) and their labels (M,).
 
-    def _turn(self, cells: npt.NDArray[np.integer], turn: npt.NDArray[np.intp]) -> npt.NDArray[np.int32]:
-        return np.ascontiguousarray(symmetry.turn_cells(cells, turn[:, None], self._height, self._width))
+        Each state is under a symmetry drawn by `rng`.
+        """
+        picked = demonstrations.take(chosen)
+        states = picked.states
+        turn = rng.integers(self._symmetries, size=len(states))
+        turn_of = turn[states.team]
+        shapes = self._shapes[states.maps][states.team]
+        turned = States(
+            maps=self._maps.index[states.maps * self._symmetries + turn],
+            offsets=states.offsets,
+            positions=symmetry.turn_cells(states.positions, turn_of, shapes),
+            goals=symmetry.turn_cells(states.goals, turn_of, shapes),
+            moves=symmetry.turn_actions(states.moves, turn_of[:, None]),
+            under_way=states.under_way,
+            seeds=states.seeds,
+            times=states.times,
+            limits=states.limits,
+            comm_radius=states.comm_radius,
+        )
+        bag = perceive(turned, self._maps, self._senses, threads=self._threads)
+        labels = symmetry.turn_actions(picked.actions, turn_of).astype(np.int64)
+        return TensorDict({**tensors(bag)._asdict(), EXPERT_ACTION: torch.from_numpy(labels)})
+
+    def prefetched(
+        self,
+        demonstrations: Demonstrations,
+        draws: Sequence[npt.NDArray[np.integer]],
+        rng: np.random.Generator,
+        parts: int = 1,
+    ) -> Iterator[list[TensorDict]]:
+        """Yield the batch of each of `draws`, in parts; the next one is made while the one before is in use.
+
+        Batches of fewer than `LEAST` states are not divided, so that batch norm always has several robots.
+        """
+
+        def make(chosen: npt.NDArray[np.integer]) -> list[TensorDict]:
+            pieces = np.array_split(chosen, parts if len(chosen) >= LEAST else 1)
+            return [self.batch(demonstrations, piece, rng) for piece in pieces]
+
+        with ThreadPoolExecutor(1) as maker:
+            ahead = None
+            for chosen in draws:
+                after = maker.submit(make, chosen)
+                if ahead is not None:
+                    yield ahead.result()
+                ahead = after
+            if ahead is not None:
+                yield ahead.result()

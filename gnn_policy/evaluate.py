@@ -11,10 +11,11 @@ import tyro
 from rich.console import Console
 
 from gnn_policy import checkpoint
+from gnn_policy.cases import Task
 from gnn_policy.command_line import run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
-from gnn_policy.results_file import refuse_other_settings, settings_of, variants_of_training
+from gnn_policy.results_file import refuse_other_settings, settings_of, variants_of
 from mapf_env.generation import MapStyle
 
 
@@ -33,10 +34,10 @@ class Command:
     """Team sizes N, one table for each."""
     rows: tuple[str, ...] | None = None
     """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled" or "stuck"
-    (drawn by stuck robots and their neighbours); for the latter two a temperature; the shield, "idle" or "pibt"; who
-    hears whom, "fixed" or "connected" (the radius grows until the team is connected); edge weights, "binary" or
-    "distance". Shield, range and weights are those of training where a row does not say. If not given: argmax, stuck
-    and sampled."""
+    (stuck robots and their neighbours sample); for the latter two a temperature; the shield, "idle", "pibt" or
+    "pibt_swap"; the radio's range, "fixed" or "connected" (the radius grows until the team is connected); edge weights,
+    "binary" or "distance". Where a row does not say, the shield is the policy's own, and range and weights are those of
+    training. If not given: argmax, stuck and sampled."""
     split: Literal["validation", "test"] = "test"
     """Which maps: "validation" to choose a row by, "test" to report it."""
     maps: int | None = None
@@ -52,6 +53,13 @@ class Command:
     styles: tuple[MapStyle, ...] | None = None
     """Obstacles: independent "cells", short "walls", or "maze", "room", "warehouse" and "empty", which heed no
     density; the maps take turns among the styles."""
+    files: tuple[str, ...] = ()
+    """Your own maps (.map), scenarios (.scen) and sets of instances (.json), or folders of them, instead of random
+    maps."""
+    task: Task | None = None
+    """"one_shot", or "lifelong": a robot that arrives gets a new goal, and the tables show throughput."""
+    steps: int = 256
+    """Steps of a lifelong episode."""
     data_seed: int | None = None
     """Random seed for the maps and cases; any seed gives maps that training with it does not use."""
     w: float | None = None
@@ -68,8 +76,8 @@ class Command:
     evaluation/NAME in the working folder for a policy that comes with the package."""
     threads: int = 0
     """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
-    device: str = "cpu"
-    """Where the network computes, as in "cuda"."""
+    device: str = "auto"
+    """Where the network computes: "cpu", "cuda", "mps", or "auto", the fastest that there is."""
     plugins: tuple[str, ...] = ()
     """Encoders and graph layers of your own, as "module:Class", that the policy's file may import."""
     debug: bool = False
@@ -88,22 +96,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _evaluate(command: Command) -> None:
     """Refuse what can be refused without torch, then evaluate."""
+    trained = checkpoint.trained_with(command.run)
     names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
     given = {name: value for name in names if (value := getattr(command, name)) is not None}
+    if given.keys() & {"height", "width", "density", "styles"}:
+        given["families"] = ()
     prefix = "validation_" if command.split == "validation" else ""
     if command.maps is not None:
         given[f"{command.split}_maps"] = command.maps
     if command.cases_per_map is not None:
         given[f"{prefix}cases_per_map"] = command.cases_per_map
-    config = replace(checkpoint.trained_with(command.run), **given)
-    variants = variants_of_training(config)
+    if command.files:
+        given["files"] = command.files
+    if command.task is not None:
+        given["task"] = command.task
+    config = replace(trained, **given)
+    execution = checkpoint.executed_as(command.run)
+    variants = variants_of(execution)
     if command.rows is not None:
-        variants = [Execution.parse(row, config.shield) for row in command.rows]
+        variants = [Execution.parse(row, execution.shield) for row in command.rows]
     threads = cpu_threads(command.threads)
     folder = command.out or _home(command.run)
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"{folder} is not a folder: give another one with --out")
-    settings = settings_of(config, command.num_agents, variants, command.split)
+    settings = settings_of(config, command.num_agents, variants, command.split, config.task)
     refuse_other_settings(folder / "results.json", settings, "--out")
 
     import torch
@@ -122,6 +138,8 @@ def _evaluate(command: Command) -> None:
         num_agents=command.num_agents,
         variants=variants,
         split=command.split,
+        task=config.task,
+        steps=command.steps,
         threads=threads,
         failures=command.failures,
     )

@@ -139,10 +139,10 @@ def compare(
         The rows, those of the variants first, and what the policy did in each variant.
     """
     rows, played = [], []
-    mark = "*" if policy.config.cost_to_go else ""  # that channel needs the map
+    mark = "*" if policy.config.needs_map else ""
     for variant in variants:
         progress(variant.name)
-        played.append(rollout(policy, exam.instances, seed=seed, max_steps=exam.max_steps, **asdict(variant)))
+        played.append(rollout(policy, exam.instances, execution=variant, seed=seed, max_steps=exam.max_steps))
         rows.append(score(variant.name + mark, exam, played[-1]))
     return [*rows, *baselines(exam, seed=seed, progress=progress)], played
 
@@ -154,7 +154,7 @@ BASELINES = ("random", "greedy*", "greedy,stuck*", "PIBT*", "expert*")
 def baselines(exam: Exam, *, seed: int = 0, progress: Callable[[str], None] = lambda phase: None) -> list[Score]:
     """The rows of `BASELINES`: two greedy ones, the second of which moves at random where it is stuck."""
     cases, rows = exam.instances, []
-    actors = (RandomActor(), GreedyActor(cases), GreedyActor(cases, random_when_stuck=True))
+    actors = (RandomActor(), GreedyActor(), GreedyActor(random_when_stuck=True))
     for name, actor in zip(BASELINES, actors, strict=False):
         progress(name)
         rows.append(score(name, exam, rollout(actor, cases, seed=seed, max_steps=exam.max_steps)))
@@ -188,6 +188,52 @@ def _expert_score(exam: Exam) -> Score:
     zero = Estimate(0.0, 0.0, 0.0)
     solved = np.ones(len(exam.instances), np.bool_)
     return Score("expert*", Estimate.proportion(solved), zero, zero, Estimate.average(makespans), 1.0)
+
+
+LIFELONG_BASELINES = {"random": RandomActor(), "greedy*": GreedyActor(), "PIBT*": GreedyActor(shield="pibt")}
+"""The rows of a lifelong table that learn nothing; with a star they know the whole map."""
+
+
+def compare_lifelong(
+    instances: Sequence[Instance],
+    policy: DecentralizedPolicy,
+    variants: Sequence[Execution],
+    *,
+    steps: int,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda phase: None,
+) -> tuple[dict[str, Any], list[Rollouts]]:
+    """Return the throughput of a policy and of `LIFELONG_BASELINES` on the same cases as plain data.
+
+    Returns:
+        The table, the variants' rows first, and the policy's rollouts in each variant.
+    """
+    rows, played = [], []
+    mark = "*" if policy.config.needs_map else ""
+    for variant in variants:
+        progress(variant.name)
+        played.append(rollout(policy, instances, task="lifelong", execution=variant, seed=seed, max_steps=steps))
+        rows.append(_throughput(variant.name + mark, played[-1]))
+    for name, actor in LIFELONG_BASELINES.items():
+        progress(name)
+        rows.append(_throughput(name, rollout(actor, instances, task="lifelong", seed=seed, max_steps=steps)))
+    return {"cases": len(instances), "steps": steps, "rows": rows}, played
+
+
+def _throughput(name: str, played: Rollouts) -> dict[str, Any]:
+    return {"name": name, "throughput": _finite(asdict(Estimate.average(played.throughput)))}
+
+
+def lifelong_table(title: str, result: dict[str, Any]) -> Table:
+    """Return what `compare_lifelong` returns as a table for the terminal."""
+    caption = f"{result['cases']} cases of {result['steps']} steps, 95 % intervals; * knows the whole map"
+    shown = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+    shown.add_column("", overflow="fold")
+    shown.add_column("arrivals\na step", justify="right", no_wrap=True)
+    for row in result["rows"]:
+        mean, high = row["throughput"]["mean"], row["throughput"]["high"]
+        shown.add_row(row["name"], f"{mean:.3f} ±{math.inf if high is None else high - mean:.3f}")
+    return shown
 
 
 def table(title: str, result: dict[str, Any]) -> Table:

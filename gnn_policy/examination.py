@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from gnn_policy import checkpoint, evaluation
-from gnn_policy.cases import Split
+from gnn_policy.cases import Split, Task
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.failures import count_failures, worst
@@ -20,12 +20,12 @@ from gnn_policy.results_file import (
     refuse_other_settings,
     settings_of,
     table_title,
-    variants_of_training,
+    tables_of,
+    variants_of,
     write_tables,
 )
 from gnn_policy.rollout import Rollouts
-from gnn_policy.training import split_cases
-from mapf_env import Scene, animate, replay_scenes
+from mapf_env import EnvConfig, Scene, animate, replay_scenes
 
 
 def examine(
@@ -37,6 +37,8 @@ def examine(
     num_agents: Sequence[int] = (),
     variants: Sequence[Execution] | None = None,
     split: Split = "test",
+    task: Task = "one_shot",
+    steps: int = 256,
     threads: int,
     failures: int = 0,
 ) -> None:
@@ -50,57 +52,69 @@ def examine(
         config: The held-out cases, the expert's w, T_max in its makespans, and the seed of draws and ties.
         folder: Where the files go.
         console: Where the tables go.
-        num_agents: Team sizes N; the one of `config` if none is given.
-        variants: How to execute the policy, one row for each; `variants_of_training` if not given.
+        num_agents: Team sizes N; those of `config` if none is given.
+        variants: How to execute the policy, one row for each; `variants_of(policy.execution)` if not given.
         split: Which maps.
+        task: "lifelong" shows throughput, without the expert.
+        steps: Steps of a lifelong episode.
         threads: CPU threads of the expert.
-        failures: How many cases of the first variant to show next to the expert's solutions, for each team size, in
-            failures.html; the worst of each kind of failure come first. With them every size is played.
+        failures: How many cases of the first variant to show next to the expert's solutions, for each table, in
+            failures.html; the worst of each kind of failure come first. With them every table is computed.
 
     Raises:
-        ValueError: If there is no variant, or `failures` is negative.
+        ValueError: If there is no variant, or `failures` is negative or asked for in a lifelong task.
         FileExistsError: If the folder has results of other settings.
     """
     if variants is None:
-        variants = variants_of_training(config)
+        variants = variants_of(policy.execution)
     if not variants:
         raise ValueError("there is no way to execute the policy: give at least one row")
     if failures < 0:
         raise ValueError(f"failures must not be negative, got {failures}")
-    settings = {"policy": checkpoint.fingerprint(policy), **settings_of(config, num_agents, variants, split)}
-    sizes, numbers = settings["num_agents"], folder / "results.json"
+    if failures and task == "lifelong":
+        raise ValueError("a lifelong team cannot fail: leave failures out")
+    settings = {
+        "policy": checkpoint.fingerprint(policy),
+        **settings_of(config, num_agents, variants, split, task),
+        **({"steps": steps} if task == "lifelong" else {}),
+    }
+    cases, numbers = tables_of(config, num_agents), folder / "results.json"
     refuse_other_settings(numbers, settings, "--out")
     tables = read_tables(numbers)
-    finished = set() if failures or tables.keys() >= set(sizes) else tables.keys() & set(sizes)
-    cases = {N: split_cases(config, split, N) for N in sizes if N not in finished}
+    finished = set() if failures or tables.keys() >= cases.keys() else tables.keys() & cases.keys()
+    held_out = {name: each.cases(split).instances for name, each in cases.items() if name not in finished}
+    show = evaluation.table if task == "one_shot" else evaluation.lifelong_table
+    rivals = evaluation.BASELINES if task == "one_shot" else evaluation.LIFELONG_BASELINES
     scenes: list[Scene] = []
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("", total=len(cases) * (len(variants) + len(evaluation.BASELINES)))
-        for N in sizes:
-            title = table_title(N, settings)
-            if N in finished:
-                console.print(evaluation.table(title, tables[N]))
+        bar = progress.add_task("", total=len(held_out) * (len(variants) + len(rivals)))
+        for name in cases:
+            title = table_title(name, settings)
+            if name in finished:
+                console.print(show(title, tables[name]))
                 continue
-            progress.update(task, description=f"{title}: expert")
-            exam = evaluation.Exam.prepare(cases[N], w=config.w, timeout=config.timeout, threads=threads)
-            rows, shown = evaluation.compare(
-                exam,
-                policy,
-                variants,
-                seed=config.seed,
-                progress=lambda phase, title=title: progress.update(task, description=f"{title}: {phase}", advance=1),
-            )
-            progress.advance(task)
-            kinds = {each.name: count_failures(played) for each, played in zip(variants, shown, strict=True)}
-            table = {**evaluation.as_json(rows, exam), "failures": kinds}
-            console.print(evaluation.table(title, table))
+
+            def advance(phase: str, title: str = title) -> None:
+                progress.update(bar, description=f"{title}: {phase}", advance=1)
+
+            if task == "lifelong":
+                tables[name], shown = evaluation.compare_lifelong(
+                    held_out[name], policy, variants, steps=steps, seed=config.seed, progress=advance
+                )
+            else:
+                progress.update(bar, description=f"{title}: expert")
+                exam = evaluation.Exam.prepare(held_out[name], w=config.w, timeout=config.timeout, threads=threads)
+                rows, shown = evaluation.compare(exam, policy, variants, seed=config.seed, progress=advance)
+                progress.advance(bar)
+                kinds = {each.name: count_failures(played) for each, played in zip(variants, shown, strict=True)}
+                tables[name] = {**evaluation.as_json(rows, exam), "failures": kinds}
+                if failures:
+                    scenes += worst(shown[0], exam.solutions, failures)
+                    heading = f"The worst cases of {variants[0].name} next to the expert's solutions"
+                    perceived = EnvConfig(**variants[0].env_settings(policy.config))
+                    replay_scenes(scenes, folder / "failures.html", title=heading, config=perceived)
+            console.print(show(title, tables[name]))
             _animate(shown, folder / "animation.svg")
-            if failures:
-                scenes += worst(shown[0], exam.solutions, failures)
-                heading = f"The worst cases of {variants[0].name} next to the expert's solutions"
-                perceived = variants[0].perceived(policy.config)
-                replay_scenes(scenes, folder / "failures.html", title=heading, config=perceived)
-            tables[N] = table
             write_tables(numbers, settings, tables)
     console.print(f"animation: {folder / 'animation.svg'}", highlight=False)
     if scenes:
@@ -110,11 +124,15 @@ def examine(
 
 def _animate(shown: Sequence[Rollouts], path: Path) -> None:
     """Write an animation of a case of the best variant."""
-    best = max(shown, key=lambda played: played.success.mean())
+    best = max(shown, key=lambda played: (played.success.mean(), played.throughput.mean()))
     case = _worth_watching(best)
+    lifelong = len(best.goals[case]) > 1
     outcome = "all on goal" if best.success[case] else "timed out"
+    if lifelong:
+        outcome = f"{best.throughput[case]:.2f} arrivals a step"
     title = f"Trained policy, {best.instances[case].num_agents} robots, unseen map: {outcome}"
-    animate(best.instances[case], best.solutions[case], path, title=title)
+    goals = best.goals[case] if lifelong else None
+    animate(best.instances[case], best.solutions[case], path, title=title, goals=goals)
 
 
 def _worth_watching(played: Rollouts) -> int:

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from gnn_policy.policy_config import CommRange, CommWeights, PolicyConfig
-from mapf_env import EnvConfig, _native
+from gnn_policy.policy_config import PolicyConfig
+from mapf_env import Action, Senses
 from mapf_env.arguments import number
-from mapf_env.rules import Positions
+from mapf_env.config import Shield
+from mapf_env.hashing import mix
+from mapf_env.senses import CommRange, CommWeights
 
 Sample = Literal[False, True, "stuck"]
-Shield = Literal["idle", "pibt"]
 Seeds = npt.NDArray[np.uint64]
+Flags = npt.NDArray[np.bool_]
+Logits = npt.NDArray[np.float32]
 
 _MOVES = np.uint64(2**32)  # what the draws are used for; the native core's uses are small numbers
-
-STUCK_MEMORY = 16
-"""How many earlier cells a robot remembers to know that it is stuck."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +34,7 @@ class Execution:
 
     sample: Sample = False
     """Draw a robot's move from the softmax in place of the most probable one: never, always, or while it or a neighbour
-    is "stuck", see `is_stuck` and `hears_of`."""
+    is "stuck": off its goal and back on a cell where it stood in one of its last 16 steps."""
     temperature: float = 1.0
     """Divides the logits where moves are drawn."""
     shield: Shield = "idle"
@@ -60,20 +61,16 @@ class Execution:
                 "for the most probable move: sample=False"
             )
 
-    def values(
-        self, logits: npt.NDArray[np.float32], alarmed: npt.NDArray[np.bool_], seeds: Seeds, time: int
-    ) -> npt.NDArray[np.float32]:
-        """What each move is worth at `time`; the greatest is taken, and PIBT takes their order.
+    def scores(self, logits: Logits, alarmed: Flags, noise: Callable[[Flags], Logits]) -> Logits:
+        """Return a score for each move; the greatest is taken, and PIBT takes their order.
 
-        A robot that draws adds Gumbel noise to its logits over the temperature: the greatest value is then a draw from
-        the softmax, and the order one move after another without replacement. The noise is a function of the robot's
-        seed and the time.
+        A robot that draws adds Gumbel noise to its logits over the temperature: the greatest score is then a draw from
+        the softmax, and the order draws one move after another without replacement.
 
         Args:
-            logits: (..., 5) of robots.
-            alarmed: (...) who is stuck or hears a robot that is.
-            seeds: (...) the robots' seeds.
-            time: Steps since the start.
+            logits: (M, 5) of robots.
+            alarmed: (M,) robots that are stuck or hear a robot that is.
+            noise: Returns Gumbel noise (m, 5) for the m robots that a mask (M,) selects.
 
         Raises:
             ValueError: If a logit, or a logit over the temperature, is not finite.
@@ -86,21 +83,27 @@ class Execution:
         draws = alarmed if self.sample == "stuck" else np.full_like(alarmed, self.sample)
         if not draws.any():
             return logits
-        noise = -np.log(-np.log(uniform(seeds[draws], time, logits.shape[-1]).clip(1e-12, 1 - 1e-12)))
-        values = logits.copy()
+        scores = logits.copy()
         with np.errstate(all="ignore"):
-            values[draws] = logits[draws] / self.temperature + noise
-        if not np.isfinite(values).all():
+            scores[draws] = logits[draws] / self.temperature + noise(draws)
+        if not np.isfinite(scores).all():
             raise ValueError(f"the logits over a temperature of {self.temperature} are not finite: give a higher one")
-        return values
+        return scores
 
-    def perceived(self, policy: PolicyConfig) -> EnvConfig:
-        """What the robots of a policy see and hear when it is executed so; all else is the default's."""
-        return EnvConfig(
-            fov_radius=policy.fov_radius,
-            comm_radius=policy.comm_radius,
-            comm_range=self.comm_range or policy.comm_range,
-        )
+    def senses(self, policy: PolicyConfig) -> Senses:
+        """Return what robots of `policy` perceive: what it reads, and at the end "stuck" where stuck robots sample."""
+        perceived: dict[str, Any] = policy.senses()
+        if self.sample == "stuck" and "stuck" not in policy.robot_features:
+            perceived["robot_features"] = (*policy.robot_features, "stuck")
+        if self.comm_range is not None:
+            perceived["comm_range"] = self.comm_range
+        if self.comm_weights is not None:
+            perceived["comm_weights"] = self.comm_weights
+        return Senses(**perceived)
+
+    def env_settings(self, policy: PolicyConfig) -> dict[str, Any]:
+        """Return the settings of an environment in which `policy` is executed so: senses and shield."""
+        return self.senses(policy).senses() | {"shield": self.shield}
 
     @property
     def name(self) -> str:
@@ -112,12 +115,12 @@ class Execution:
         return ",".join([*words, *(each for each in (self.comm_range, self.comm_weights) if each)])
 
     @staticmethod
-    def parse(text: str, shield: str = "idle") -> Execution:
-        """The variant of the given name, its words in any order.
+    def parse(text: str, shield: Shield = "idle") -> Execution:
+        """Return the variant of the given name, its words in any order.
 
         Args:
             text: The words.
-            shield: Which shield it has if no word names one.
+            shield: The shield if no word names one.
 
         Raises:
             ValueError: If a word is unknown or contradicts another.
@@ -149,34 +152,31 @@ def _number(word: str, text: str) -> float:
         raise ValueError(f"unknown word {word!r} in the variant {text!r}: give {known} or a temperature") from None
 
 
-def is_stuck(positions: Positions, goals: Positions, past: Positions) -> npt.NDArray[np.bool_]:
-    """(B, N) which robots are stuck: off their goal, on a cell where they stood at one of the last steps.
-
-    So a robot that was stopped is stuck in the next step, and one that goes to and fro or in a circle as soon as it
-    comes back; one on its way never is. A robot knows it by itself, from its odometry: no map, no messages.
+def alarmed(stuck: Flags, edge_index: npt.NDArray[np.int64]) -> Flags:
+    """Return which of M robots are stuck or hear a robot that is: one bit in the first message of a step.
 
     Args:
-        positions: (B, N, 2) now.
-        goals: (B, N, 2)
-        past: (T, B, N, 2) at the T steps before; `STUCK_MEMORY` of them in play, fewer in the beginning.
+        stuck: (M,) stuck robots.
+        edge_index: (2, E) senders and receivers.
     """
-    return np.logical_and((past == positions).all(-1).any(0), (positions != goals).any(-1))
+    alarm = stuck.copy()
+    sender, receiver = edge_index
+    alarm[receiver[stuck[sender]]] = True
+    return alarm
 
 
-def hears_of(stuck: npt.NDArray[np.bool_], graph: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """(B, N) who hears of a stuck robot (B, N) over the graph (B, N, N): one bit in the first message of a step."""
-    return np.any((graph > 0) & stuck[:, None, :], axis=-1)
+def robot_seeds(seeds: Seeds, robots: npt.NDArray[np.integer]) -> Seeds:
+    """Return the seeds (M,) from which robots with numbers (M,) in teams with seeds (M,) draw their moves."""
+    return mix(mix(seeds, np.full_like(seeds, _MOVES)), robots.astype(np.uint64))
 
 
-def robot_seeds(seeds: Seeds, num_agents: int) -> Seeds:
-    """The seeds (B, N) from which the robots of teams with seeds (B,) draw their moves."""
-    robots = np.tile(np.arange(num_agents, dtype=np.uint64), len(seeds))
-    streams = _native.mix(seeds, np.full_like(seeds, _MOVES))
-    return _native.mix(np.repeat(streams, num_agents), robots).reshape(-1, num_agents)
+def gumbel(seeds: Seeds, times: npt.NDArray[np.integer]) -> Logits:
+    """Return Gumbel noise (M, 5) that depends only on each robot's seed and time, both (M,)."""
+    return -np.log(-np.log(uniform(seeds, times, len(Action)).clip(1e-12, 1 - 1e-12))).astype(np.float32)
 
 
-def uniform(seeds: Seeds, time: int, count: int) -> npt.NDArray[np.float64]:
-    """Draws (*S, count) from [0, 1) at a time for seeds of any shape S, a function of the arguments alone."""
-    counters = np.uint64(time * count) + np.arange(count, dtype=np.uint64)
-    words = _native.mix(np.repeat(seeds.ravel(), count), np.tile(counters, seeds.size))
-    return ((words >> np.uint64(11)).astype(np.float64) * 2.0**-53).reshape(*seeds.shape, count)
+def uniform(seeds: Seeds, times: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.float64]:
+    """Return draws (M, count) from [0, 1) that depend only on each seed and time, both (M,)."""
+    counters = times.astype(np.uint64)[:, None] * np.uint64(count) + np.arange(count, dtype=np.uint64)
+    words = mix(np.repeat(seeds, count), counters.ravel())
+    return ((words >> np.uint64(11)).astype(np.float64) * 2.0**-53).reshape(len(seeds), count)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnn_policy.rollout import Rollouts
-from mapf_env import Instance, Scene, Solution, _native
+from mapf_env import Instance, Scene, Solution, distances
 
 Failure = Literal["goal blocked", "deadlock", "oscillation", "livelock", "out of time"]
 MEANINGS: dict[Failure, str] = {
@@ -49,8 +49,8 @@ def failure(instance: Instance, solution: Solution) -> Failure | None:
     recent = paths[first:]
     rows, cols = paths[..., 0], paths[..., 1]
     robots = np.arange(instance.num_agents)
-    distances = _native.distances(instance.grid, instance.goals)[robots, rows, cols]
-    stalled = late & (distances[first:].min(axis=0) >= distances[: first + 1].min(axis=0))
+    steps = distances(instance.grid, instance.goals)[robots, rows, cols]
+    stalled = late & (steps[first:].min(axis=0) >= steps[: first + 1].min(axis=0))
     if not stalled.any():
         return "out of time"
     resting = (recent == instance.goals).all(axis=(0, 2))
@@ -66,7 +66,7 @@ def _cut_off(
     """Whether no way leads from the cell to the goal around the robots that rest on their goals."""
     blocked = instance.grid.copy()
     blocked[tuple(instance.goals[resting].T)] = True
-    return bool(_native.distances(blocked, goal[None].astype(np.int32))[0, cell[0], cell[1]] < 0)
+    return bool(distances(blocked, goal[None].astype(np.int32))[0, cell[0], cell[1]] < 0)
 
 
 def count_failures(played: Rollouts) -> dict[Failure, int]:

@@ -8,18 +8,16 @@ wait for each other once a step, asleep.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
 from tensordict import TensorDict
 
 from gnn_policy.config import Precision
-from gnn_policy.imitation import ImitationLoss
+from gnn_policy.imitation import EXPERT_ACTION, ImitationLoss
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
-
-LEAST = 4
-"""Smaller batches are not halved, so that batch norm always has several robots."""
 
 
 class HalfBatches:
@@ -47,37 +45,39 @@ class HalfBatches:
         """CPU threads of a half."""
         self._pool = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(self.threads,))
 
-    def backward(self, batch: TensorDict) -> tuple[float, float]:
-        """Set the gradients of the policy's weights; return the mean loss and accuracy of the batch."""
+    def backward(self, parts: Sequence[TensorDict]) -> torch.Tensor:
+        """Set the gradients of the policy's weights; return the mean loss and accuracy (2,) over all robots.
+
+        Args:
+            parts: The two halves of a batch, or all of a small one.
+        """
         self._policy.zero_grad()
         self._twin.zero_grad()
         self._twin.train(self._policy.training)
-        size = len(batch)
-        middle = size // 2 if size >= LEAST else 0
-        if not middle:
-            return self._half(0, batch, 1.0)
-        halves = ((0, batch[:middle], middle / size), (1, batch[middle:], 1 - middle / size))
+        robots = sum(len(part[EXPERT_ACTION]) for part in parts)
+        halves = [(number, part, len(part[EXPERT_ACTION]) / robots) for number, part in enumerate(parts)]
+        if len(halves) == 1:
+            return self._half(*halves[0])
         if self._at_once:
             second = self._pool.submit(self._half, *halves[1])
-            outcomes = (self._half(*halves[0]), second.result())
+            figures = self._half(*halves[0]) + second.result()
         else:
             before = torch.get_rng_state()
-            outcomes = tuple(self._half(*half) for half in halves)
+            figures = self._half(*halves[0]) + self._half(*halves[1])
             if self._at_once is None:
                 self._at_once = torch.equal(before, torch.get_rng_state())
         with torch.no_grad():
             for weight, other in zip(self._policy.parameters(), self._twin.parameters(), strict=True):
                 if weight.grad is not None and other.grad is not None:
                     weight.grad += other.grad
-        loss, accuracy = (sum(figures) for figures in zip(*outcomes, strict=True))
-        return loss, accuracy
+        return figures
 
-    def _half(self, number: int, batch: TensorDict, share: float) -> tuple[float, float]:
-        """Add the gradients of a part of the batch; return its parts of loss and accuracy."""
+    def _half(self, number: int, batch: TensorDict, share: float) -> torch.Tensor:
+        """Add the gradients of a part of the batch; return its parts (2,) of loss and accuracy."""
         with autocast(self._precision, self._policy.head.weight.device):
             outcome = self._losses[number](batch)
         (outcome["loss_imitation"] * share).backward()
-        return outcome["loss_imitation"].item() * share, outcome["accuracy"].item() * share
+        return torch.stack([outcome["loss_imitation"].detach(), outcome["accuracy"]]) * share
 
     def close(self) -> None:
         """End the second thread."""

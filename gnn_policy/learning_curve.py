@@ -37,19 +37,28 @@ class Round:
     unlabelled: int
     """States of this round that the expert did not solve."""
     validation_success: float | None = None
-    """Success rate on the validation cases, argmax."""
+    """Success rate on the validation cases, executed as in the rollouts of training."""
     validation_flowtime_increase: float | None = None
-    """Flowtime increase on the validation cases, argmax, over all cases."""
+    """Flowtime increase on the validation cases, over all cases."""
+    validation_throughput: float | None = None
+    """Arrivals a step on the validation cases of a lifelong training."""
+
+    @property
+    def validation(self) -> float | None:
+        """The success rate or the throughput on the validation cases, if they were played in this round."""
+        return self.validation_success if self.validation_throughput is None else self.validation_throughput
 
 
 def draw_learning_curve(rounds: Sequence[Round], path: Path) -> None:
-    """Draw validation success and training loss against the robot states trained on, as PNG."""
+    """Draw validation success, or throughput, and training loss against the robot states trained on, as PNG."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    judged = [row for row in rounds if row.validation_success is not None]
-    successes = [row.validation_success for row in judged]
-    left.plot([row.samples / 1e6 for row in judged], successes, "o-", color="#1f6feb")
-    left.set(title="validation success (argmax)", ylim=(0, 1), ylabel="success rate")
+    judged = [row for row in rounds if row.validation is not None]
+    left.plot([row.samples / 1e6 for row in judged], [row.validation for row in judged], "o-", color="#1f6feb")
+    if any(row.validation_throughput is not None for row in judged):
+        left.set(title="validation throughput", ylim=(0, None), ylabel="arrivals a step")
+    else:
+        left.set(title="validation success", ylim=(0, 1), ylabel="success rate")
     samples = [row.samples / 1e6 for row in rounds]
     right.plot(samples, [row.loss for row in rounds], color="#d1570b", label="loss")
     right.plot(samples, [row.accuracy for row in rounds], color="#57606a", label="accuracy")

@@ -1,17 +1,22 @@
-"""The paper's network: a CNN reads each view, a graph filter exchanges features, a shared MLP picks a move."""
+"""The paper's network: a CNN reads each view, a graph layer exchanges features, a shared MLP picks a move."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
+from gnn_policy.acting import act
 from gnn_policy.convolution import StridedConvolution
+from gnn_policy.execution import Execution
+from gnn_policy.layers import GRAPH_LAYERS
 from gnn_policy.plugins import import_by_name
 from gnn_policy.policy_config import PolicyConfig
-from mapf_env import Action
+from mapf_env import Action, Bag
 
 
 def released_encoder(channels: int, side: int, features: int) -> nn.Sequential:
@@ -53,40 +58,8 @@ def lean_encoder(channels: int, side: int, features: int) -> nn.Sequential:
 ENCODERS = {"released": released_encoder, "lean": lean_encoder}
 
 
-def shift_operator(graph: Float[Tensor, "*B N N"]) -> Float[Tensor, "*B N N"]:
-    """The graph shift operator S = D^-1/2 A D^-1/2 of the adjacency A; the row of an isolated robot is zero.
-
-    Source: the paper's released code; the paper leaves S open.
-    """
-    degree = graph.sum(-1)
-    scale = torch.where(degree > 0, degree.clamp(min=1e-12).rsqrt(), 0.0)
-    return scale.unsqueeze(-1) * graph * scale.unsqueeze(-2)
-
-
-class GraphFilter(nn.Module):
-    """The graph convolution A(X; S) = sum over k < K of S^k X A_k (equation 1 of the paper), with a bias.
-
-    K taps make K - 1 exchanges with neighbours, so a robot's output depends on its (K - 1)-hop neighbourhood alone.
-    """
-
-    def __init__(self, in_features: int, out_features: int, taps: int) -> None:
-        super().__init__()
-        self.taps = taps
-        self.mix = nn.Linear(taps * in_features, out_features)
-
-    def forward(self, signal: Float[Tensor, "B N F"], graph: Float[Tensor, "B N N"]) -> Float[Tensor, "B N G"]:
-        """Filter the features of all robots over the communication graph, by its shift operator."""
-        shift, shifted = shift_operator(graph), [signal]
-        for _ in range(self.taps - 1):
-            shifted.append(torch.bmm(shift, shifted[-1]))
-        return self.mix(torch.cat(shifted, dim=-1))
-
-
-GRAPH_LAYERS = {"filter": GraphFilter}
-
-
 def _part(what: str, name: str, known: Mapping[str, Callable[..., nn.Module]]) -> Callable[..., nn.Module]:
-    """What makes the part of a network that has this name."""
+    """Return the maker of the part of a network that has this name."""
     if name in known:
         return known[name]
     part = import_by_name(name, what, known)
@@ -96,44 +69,104 @@ def _part(what: str, name: str, known: Mapping[str, Callable[..., nn.Module]]) -
 
 
 class DecentralizedPolicy(nn.Module):
-    """Views and the communication graph of a team to the logits of every robot's move.
+    """The network: what the robots of a bag see, know and hear, to the logits of every robot's move.
 
-    All robots share the weights, whose number does not depend on the team's size.
+    All robots share the weights, whose number does not depend on the size of a team.
+
+    Args:
+        config: The network and what its robots perceive.
+        execution: How the policy is executed unless a caller says otherwise; it is saved with the weights.
 
     Raises:
-        ValueError: If the configuration names a part that cannot be found or is no network.
+        ValueError: If the configuration names a part that cannot be found or is not a network.
     """
 
-    def __init__(self, config: PolicyConfig = PolicyConfig()) -> None:
+    def __init__(self, config: PolicyConfig = PolicyConfig(), execution: Execution = Execution()) -> None:
         super().__init__()
-        self.config = config
+        self.config, self.execution = config, execution
+        F, K, D = config.features, config.num_robot_features, config.num_edge_features
         make_encoder = _part("encoder", config.encoder, ENCODERS)
         make_layer = _part("graph_layer", config.graph_layer, GRAPH_LAYERS)
-        self.encoder = make_encoder(config.channels, 2 * config.fov_radius + 3, config.features)
-        self.filter = make_layer(config.features, config.features, config.taps)
-        self.head = nn.Linear(config.features, len(Action))
+        self.encoder = make_encoder(config.num_channels, config.fov_side, F)
+        self.join = nn.Sequential(nn.Linear(F + K, F), nn.ReLU()) if K else None
+        self.graph_layer = make_layer(F, F, config.taps, D)
+        self.head = nn.Linear(F, len(Action))
         self.to(memory_format=torch.channels_last)
 
-    def forward(self, fov: Shaped[Tensor, "B N C S S"], graph: Float[Tensor, "B N N"]) -> Float[Tensor, "B N 5"]:
-        """Logits over the five moves from views (float or uint8) and adjacency."""
-        features = self.extract(fov.flatten(0, 1)).unflatten(0, fov.shape[:2])
-        return self.decide(self.filter(features, graph))
+    def forward(self, bag: Bag) -> Float[Tensor, "M 5"]:
+        """Return the logits over the five moves of each robot of a bag, whose arrays are tensors.
 
-    def extract(self, fov: Shaped[Tensor, "M C S S"]) -> Float[Tensor, "M F"]:
-        """The features that robots extract from their views and communicate."""
-        config = self.config
-        side = 2 * config.fov_radius + 3
-        if fov.shape[-1] != side or fov.shape[-3] != config.channels:
+        Raises:
+            ValueError: If views, scalars or edge features are not those that the policy was made for.
+        """
+        D = self.config.num_edge_features
+        if bag.edge_attr.shape[-1] != D:
             raise ValueError(
-                f"views are {fov.shape[-3]}x{fov.shape[-2]}x{fov.shape[-1]}, this policy reads "
-                f"{config.channels}x{side}x{side}: observe with fov_radius={config.fov_radius}, "
-                f"{'with' if config.cost_to_go else 'without'} cost_to_go"
+                f"links have {bag.edge_attr.shape[-1]} features, this policy reads {D}: make the environment with "
+                f"edge_features={self.config.edge_features} and memory={self.config.memory}"
             )
-        views = fov.to(self.head.weight.dtype, memory_format=torch.channels_last)
-        if config.cost_to_go and fov.dtype == torch.uint8:  # counted from -2 r
-            views[:, 3] = views[:, 3] / (2 * config.fov_radius) - 1
-        return self.encoder(views)
+        return self.decide(self.graph_layer(self.extract(bag.fov, bag.scalars), bag))
 
-    def decide(self, filtered: Float[Tensor, "*B F"]) -> Float[Tensor, "*B 5"]:
-        """Logits from what the graph layer gives."""
-        return self.head(torch.relu(filtered))
+    def extract(self, fov: Shaped[Tensor, "M C S S"], scalars: Float[Tensor, "M K"]) -> Float[Tensor, "M F"]:
+        """Return the features that robots make from their views (float or uint8) and scalars, and communicate.
+
+        Raises:
+            ValueError: If views or scalars are not those that the policy was made for.
+        """
+        config = self.config
+        expected = (config.num_channels, config.fov_side, config.fov_side)
+        if fov.shape[1:] != expected:
+            raise ValueError(
+                f"views are {tuple(fov.shape[1:])}, this policy reads {expected}: make the environment with "
+                f"fov_radius={config.fov_radius} and extra_channels={config.extra_channels}"
+            )
+        K = config.num_robot_features
+        if scalars.shape[-1] < K:
+            raise ValueError(
+                f"robots have {scalars.shape[-1]} scalars, this policy reads {K}: make the environment with "
+                f"robot_features={config.robot_features} and memory={config.memory}"
+            )
+        dtype = self.head.weight.dtype
+        views = fov.to(dtype, memory_format=torch.channels_last)
+        if fov.dtype == torch.uint8:
+            for channel, (unit, low) in enumerate(zip(config.channel_unit, config.channel_low, strict=True)):
+                if unit != 1 or low != 0:
+                    views[:, channel] = views[:, channel] / float(unit) + float(low)
+        features = self.encoder(views)
+        if self.join is None:
+            return features
+        return self.join(torch.cat([features, scalars[:, :K].to(features.dtype)], dim=-1))
+
+    def decide(self, gathered: Float[Tensor, "M F"]) -> Float[Tensor, "M 5"]:
+        """Return the logits from what the graph layer gives."""
+        return self.head(torch.relu(gathered))
+
+    def env_settings(self) -> dict[str, Any]:
+        """Return the settings of an environment in which robots perceive what the policy needs, under its shield."""
+        return self.execution.env_settings(self.config)
+
+    def act(
+        self,
+        observation: Any,
+        *,
+        execution: Execution | None = None,
+        seed: int | np.random.Generator | None = None,
+    ) -> Any:
+        """Choose actions from the observations of an environment that was made with `env_settings`.
+
+        Args:
+            observation: What `parallel_env` (a dictionary by agent), `BatchedEnv` (an `Observation` or a `Bag`) or
+                `TeamEnv` (a TensorDict) returned.
+            execution: How moves are chosen from logits; the policy's own if not given.
+            seed: Of the draws; a generator goes on with its stream.
+
+        Returns:
+            One action for each robot in the form that the environment's `step` takes: a dictionary by agent, an array
+            (B, N), or, for a `Bag`, an array (M,). With a PIBT shield scores of all five moves instead of each
+            action: (5,), (B, N, 5) or (M, 5); `parallel_env` takes them with preferences=True.
+
+        Raises:
+            ValueError: If the observation lacks something that the policy reads.
+            TypeError: If it is something else.
+        """
+        return act(self, observation, execution or self.execution, np.random.default_rng(seed))

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
 
 from gnn_policy import checkpoint
+from gnn_policy.cases import Task
 from gnn_policy.command_line import run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
-from mapf_env import Instance, _native, replay
+from mapf_env import EnvConfig, Instance, distances, replay
 from mapf_env.arguments import integer
 from mapf_env.files import require_outputs, unused
 from mapf_env.problem_file import load_problem
+
+if TYPE_CHECKING:
+    from gnn_policy.rollout import Rollouts
 
 PATIENCE = 4
 """T_max in lengths of the longest way that a robot has to go."""
@@ -39,8 +43,11 @@ class Command:
     """The map of a scenario, if it does not lie beside it."""
     index: int | None = None
     """Which instance or map of a file, from 0; the first if not given."""
-    row: str = "stuck"
-    """How to execute the policy, in the words of the rows of `python -m gnn_policy.evaluate`."""
+    row: str | None = None
+    """How to execute the policy, in the words of the rows of `python -m gnn_policy.evaluate`; as its file says if not
+    given."""
+    task: Task = "one_shot"
+    """"lifelong": a robot that arrives gets a new goal."""
     max_steps: int | None = None
     """T_max; four times the longest way that a robot has to go if not given."""
     seed: int = 0
@@ -50,8 +57,8 @@ class Command:
     with a number if there is such a file."""
     threads: int = 0
     """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
-    device: str = "cpu"
-    """Where the network computes, as in "cuda"."""
+    device: str = "auto"
+    """Where the network computes: "cpu", "cuda", "mps", or "auto", the fastest that there is."""
     plugins: tuple[str, ...] = ()
     """Encoders and graph layers of your own, as "module:Class", that the policy's file may import."""
     debug: bool = False
@@ -71,7 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _play(command: Command) -> None:
     """Refuse what can be refused without torch, then play."""
     threads = cpu_threads(command.threads)
-    execution = Execution.parse(command.row, checkpoint.trained_under(command.run))
+    execution = checkpoint.executed_as(command.run)
+    if command.row is not None:
+        execution = Execution.parse(command.row, execution.shield)
     instance = load_problem(
         command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed
     )
@@ -82,7 +91,6 @@ def _play(command: Command) -> None:
     import torch
 
     from gnn_policy.command_line import on_device
-    from gnn_policy.failures import failure
     from gnn_policy.rollout import rollout
 
     torch.set_num_threads(threads)
@@ -91,21 +99,39 @@ def _play(command: Command) -> None:
     size = f"{instance.num_agents} robots on {instance.grid.shape[0]} x {instance.grid.shape[1]} cells"
     before = time.perf_counter()
     with console.status(f"{size}, {steps} steps at most"):
-        played = rollout(policy, [instance], seed=command.seed, max_steps=steps, **asdict(execution))
+        played = rollout(policy, [instance], task=command.task, execution=execution, seed=command.seed, max_steps=steps)
     seconds = time.perf_counter() - before
     (solution,) = played.solutions
-    home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
-    kind = failure(instance, solution)
-    told = f"{size}: {home} on goal after {len(solution.paths) - 1} steps"
-    told += f", flowtime {solution.sum_of_costs}" if kind is None else f", failed: {kind}"
-    replay(instance, solution, out, title=told, config=execution.perceived(policy.config))
+    told = f"{size}: {_outcome(command.task, played)}"
+    replay(
+        instance,
+        solution,
+        out,
+        title=told,
+        config=EnvConfig(**execution.env_settings(policy.config)),
+        goals=played.goals[0] if command.task == "lifelong" else None,
+    )
     console.print(f"{told} ({seconds:.1f} s)", highlight=False)
     console.print(f"replay: {out}", highlight=False, soft_wrap=True)
 
 
+def _outcome(task: Task, played: Rollouts) -> str:
+    from gnn_policy.failures import failure
+
+    (instance,), (solution,) = played.instances, played.solutions
+    steps = len(solution.paths) - 1
+    if task == "lifelong":
+        return f"{played.throughput[0]:.2f} arrivals a step over {steps} steps"
+    home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
+    kind = failure(instance, solution)
+    end = f"flowtime {solution.sum_of_costs}" if kind is None else f"failed: {kind}"
+    return f"{home} on goal after {steps} steps, {end}"
+
+
 def _patience(instance: Instance) -> int:
-    distances = _native.distances(instance.grid, instance.goals)
-    ways = distances[range(instance.num_agents), instance.starts[:, 0], instance.starts[:, 1]]
+    ways = distances(instance.grid, instance.goals)[
+        range(instance.num_agents), instance.starts[:, 0], instance.starts[:, 1]
+    ]
     return max(PATIENCE * int(ways.max()), 1)
 
 

@@ -12,6 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gnn_policy.learning_curve import Round
 
+_SECONDS_BETWEEN = 0.2
+
 
 class TrainingProgress:
     """A bar over all rounds with phase, rate, loss, validation success and time left, and a line for each validation.
@@ -33,8 +35,9 @@ class TrainingProgress:
             speed_estimate_period=120,
         )
         self._task = self._bar.add_task("", total=rounds, phase="preparing", figures="")
-        self._success = "-"
+        self._validation = "-"
         self._last_update = time.monotonic()
+        self._samples = self._update = 0
 
     def __enter__(self) -> TrainingProgress:
         self._bar.__enter__()
@@ -49,20 +52,26 @@ class TrainingProgress:
         """Say what round `number` is doing."""
         self._bar.update(self._task, completed=number, phase=phase)
 
-    def fitted(self, number: int, update: int, updates: int, losses: npt.NDArray[np.float64], samples: int) -> None:
-        """One gradient step of a round is done."""
+    def due(self) -> bool:
+        """Return True if it is time to show something again."""
+        return time.monotonic() - self._last_update > _SECONDS_BETWEEN
+
+    def fitted(self, number: int, update: int, updates: int, losses: npt.NDArray[np.floating], samples: int) -> None:
+        """Show the gradient steps of a round so far, which saw `samples` robot states."""
         now = time.monotonic()
-        rate, self._last_update = samples / max(now - self._last_update, 1e-9), now
-        figures = f"{rate / 1e3:.0f}k states/s loss {losses[-50:].mean():.3f} success {self._success}"
+        rate = (samples - self._samples if update > self._update else samples) / max(now - self._last_update, 1e-9)
+        self._last_update, self._samples, self._update = now, samples, update % updates
+        figures = f"{rate / 1e3:.0f}k states/s loss {losses[-50:].mean():.3f} validation {self._validation}"
         self._bar.update(self._task, completed=number + update / updates, phase="fitting", figures=figures)
 
     def finished(self, row: Round) -> None:
         """A round is done and saved."""
         self._bar.update(self._task, completed=row.round + 1)
-        if row.validation_success is not None:
-            self._success = f"{row.validation_success:.3f}"
+        if row.validation is not None:
+            self._validation = f"{row.validation:.3f}"
+            kind = "success" if row.validation_throughput is None else "throughput"
             self._console.print(
                 f"round {row.round + 1:3}  {row.seconds / 60:4.1f} min  {row.samples / 1e6:5.1f}M robot states  "
-                f"loss {row.loss:.3f}  validation success {self._success}",
+                f"loss {row.loss:.3f}  validation {kind} {self._validation}",
                 highlight=False,
             )

@@ -67,11 +67,12 @@ class Ranks:
 
 @contextmanager
 def join_ranks() -> Iterator[Ranks]:
-    """Meet the other processes that `torchrun` started, over gloo; alone without it."""
+    """Meet the other processes that `torchrun` started, over nccl between GPUs and gloo otherwise; alone without it."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Ranks()
         return
-    distributed.init_process_group("gloo", timeout=timedelta(hours=12))  # others wait while 0 validates
+    backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
+    distributed.init_process_group(backend, timeout=timedelta(hours=12))  # others wait while 0 validates
     try:
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         yield Ranks(distributed.get_rank(), distributed.get_world_size(), local)

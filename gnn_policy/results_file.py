@@ -4,35 +4,60 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from gnn_policy.cases import Split
+from gnn_policy.cases import Split, Task
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 from mapf_env.files import write_whole
 
 
-def variants_of_training(config: TrainConfig) -> list[Execution]:
-    """The rows that are evaluated by default: argmax, stuck robots draw, and all draw, under the shield of training."""
-    return [Execution(sample=sample, shield=config.shield) for sample in (False, "stuck", True)]
+def variants_of(execution: Execution) -> list[Execution]:
+    """Return the rows that are evaluated by default: argmax, stuck robots sample, all robots sample."""
+    return [replace(execution, sample=sample) for sample in (False, "stuck", True)]
 
 
 def settings_of(
-    config: TrainConfig, num_agents: Sequence[int], variants: Sequence[Execution], split: Split
+    config: TrainConfig, num_agents: Sequence[int], variants: Sequence[Execution], split: Split, task: Task = "one_shot"
 ) -> dict[str, Any]:
-    """Everything that the numbers depend on, except for the policy."""
+    """Return everything that the numbers depend on, except for the policy."""
     maps, cases_per_map = config.size_of(split)
     names = ("height", "width", "density", "data_seed", "w", "timeout", "seed")
     return {
         "variants": [variant.name for variant in variants],
-        "num_agents": list(num_agents) or [config.num_agents],
+        "tables": list(tables_of(config, num_agents)),
         "split": split,
+        "task": task,
         "maps": maps,
         "cases_per_map": cases_per_map,
         "styles": list(config.styles),
+        "families": json.loads(json.dumps([asdict(family) for family in config.families])),
+        "files": list(config.files),
         **{name: getattr(config, name) for name in names},
     }
+
+
+def tables_of(config: TrainConfig, num_agents: Sequence[int]) -> dict[str, TrainConfig]:
+    """Return the names of the tables of an evaluation, each with the settings of its cases.
+
+    There is one for each size of the team, and for each family of cases if there are families. If no sizes are given,
+    they are those of the settings. The name of a table for a size alone is its number of robots.
+    """
+    if config.files:
+        chosen = {f"{N} robots, your maps": replace(config, num_agents=N) for N in num_agents}
+        return chosen or {"your maps": config}
+    if not config.families:
+        return {str(N): replace(config, num_agents=N) for N in num_agents or (config.num_agents,)}
+    titles: dict[str, TrainConfig] = {}
+    for number, family in enumerate(config.families, 1):
+        sizes = [(N, N) for N in num_agents] or [family.num_agents]
+        for least, most in sizes:
+            robots = f"{least} robots" if least == most else f"{least} to {most} robots"
+            chosen = replace(family, num_agents=(least, most))
+            titles[f"{robots}, family {number} ({family.style})"] = replace(config, families=(chosen,))
+    return titles
 
 
 def refuse_other_settings(path: Path, settings: dict[str, Any], option: str) -> None:
@@ -60,21 +85,22 @@ def refuse_other_settings(path: Path, settings: dict[str, Any], option: str) -> 
         )
 
 
-def read_tables(path: Path) -> dict[int, dict[str, Any]]:
-    """Return the tables that a file holds, by the team's size; none if it is missing or holds something else."""
+def read_tables(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the tables that a file holds, by title; none if it is missing or holds something else."""
     try:
-        tables = json.loads(path.read_text(encoding="utf-8"))["num_agents"]
-        return {int(size): table for size, table in tables.items()}
+        tables = json.loads(path.read_text(encoding="utf-8"))["tables"]
+        return dict(tables.items())
     except (FileNotFoundError, ValueError, KeyError, AttributeError, TypeError, RecursionError):
         return {}
 
 
-def write_tables(path: Path, settings: dict[str, Any], tables: dict[int, dict[str, Any]]) -> None:
-    """Write the settings and the tables of the sizes that are finished, as a whole or not at all."""
-    finished = {str(size): tables[size] for size in settings["num_agents"] if size in tables}
-    write_whole(path, json.dumps({"settings": settings, "num_agents": finished}, indent=2) + "\n")
+def write_tables(path: Path, settings: dict[str, Any], tables: dict[str, dict[str, Any]]) -> None:
+    """Write the settings and the tables that are finished, as a whole or not at all."""
+    finished = {title: tables[title] for title in settings["tables"] if title in tables}
+    write_whole(path, json.dumps({"settings": settings, "tables": finished}, indent=2) + "\n")
 
 
-def table_title(num_agents: int, settings: dict[str, Any]) -> str:
-    """The heading of the table of a team size."""
-    return f"{num_agents} robots, {settings['maps']} {settings['split']} maps"
+def table_title(name: str, settings: dict[str, Any]) -> str:
+    """Return the heading of a table."""
+    cases = f"{name} robots" if name.isdigit() else name
+    return f"{cases}, {settings['maps']} {settings['split']} maps"

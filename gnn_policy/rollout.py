@@ -2,77 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from torch import nn
 
-from gnn_policy.execution import (
-    STUCK_MEMORY,
-    Execution,
-    Sample,
-    Shield,
-    hears_of,
-    is_stuck,
-    robot_seeds,
-)
+from gnn_policy.acting import scores_of
+from gnn_policy.cases import Task
+from gnn_policy.execution import Execution, gumbel, robot_seeds
 from gnn_policy.finite import require_finite
 from gnn_policy.network import DecentralizedPolicy
-from gnn_policy.perception import Perception
-from gnn_policy.policy_config import CommRange, CommWeights, PolicyConfig
-from mapf_env import Instance, Solution, _native, rules
+from gnn_policy.policy_config import PolicyConfig
+from mapf_env import Action, BatchedEnv, Instance, Solution
+from mapf_env.hashing import mix
 
-Cases = npt.NDArray[np.intp]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Teams:
-    """B teams at one moment of their cases, as an actor meets them."""
-
-    cases: Cases
-    """(B,) which of the instances they play."""
-    seeds: npt.NDArray[np.uint64]
-    """(B,) a hash of the case and its seed, to draw from."""
-    obstacles: rules.Bordered
-    """(B, H + 2 border, W + 2 border) the maps inside the actor's border."""
-    positions: rules.Positions
-    """(B, N, 2)"""
-    goals: rules.Positions
-    """(B, N, 2)"""
-    past: rules.Positions
-    """(T, B, N, 2) positions at up to as many earlier steps as the actor remembers."""
-    time: int
-    """Steps since the start."""
+_MOST_BYTES = 2**28
+"""Memory for the distance tables of teams that play side by side."""
 
 
 @runtime_checkable
 class Actor(Protocol):
-    """What chooses the moves of many teams at once: a class of your own that has these three."""
+    """A class of your own that chooses the moves of many teams at once."""
 
-    border: int
-    """Cells of obstacles around the maps that `act` receives; at least the radius that it observes with."""
-    memory: int
-    """How many steps back `act` receives positions."""
+    def env_settings(self) -> dict[str, Any]:
+        """Return the settings of the environment that it acts in, fields of `mapf_env.EnvConfig`: senses and shield."""
+        ...
 
-    def act(self, teams: Teams) -> npt.NDArray[Any]:
-        """Joint actions (B, N); under PIBT also values (B, N, 5)."""
+    def act(self, env: BatchedEnv) -> npt.NDArray[Any]:
+        """Return joint actions (B, N), or with a PIBT shield scores (B, N, 5); ended teams' are ignored."""
         ...
 
 
 class PolicyActor:
-    """A network on given cases, executed as `execution` says; it gives the values (B, N, 5) of the moves.
+    """A network, executed in one way; it gives the scores (B, N, 5) of the moves.
 
     Raises:
         TypeError: If the network has no `config`.
         ValueError: If its weights are not finite.
     """
 
-    def __init__(self, policy: nn.Module, instances: Sequence[Instance], execution: Execution) -> None:
+    def __init__(self, policy: nn.Module, execution: Execution) -> None:
         config = getattr(policy, "config", None)
         if not isinstance(config, PolicyConfig):
             kind = type(policy).__name__
@@ -83,129 +56,121 @@ class PolicyActor:
         weights = policy.state_dict() if isinstance(policy, DecentralizedPolicy) else dict(policy.named_parameters())
         require_finite(weights)
         self.policy, self.config, self.execution = policy, config, execution
-        self._perception = Perception(
-            config, instances, comm_range=execution.comm_range, comm_weights=execution.comm_weights
-        )
-        self._device = next((each.device for each in policy.parameters()), torch.device("cpu"))
-        self.border = config.fov_radius
-        self.memory = STUCK_MEMORY if execution.sample == "stuck" else 0
-        self._rows: dict[int, int] = {}
 
-    def act(self, teams: Teams) -> npt.NDArray[np.float32]:
-        """Observe, communicate and value the moves."""
-        count, device = len(teams.cases), self._device
-        padded = np.arange(_padded_size(count)).clip(max=count - 1)
-        fov, graph = self._perception.observe(
-            teams.cases[padded],
-            teams.obstacles[padded],
-            teams.positions[padded],
-            teams.goals[padded],
-            self._tables(teams, padded) if self.config.cost_to_go else None,
-        )
-        with torch.inference_mode():
-            logits = self.policy(torch.from_numpy(fov).to(device), torch.from_numpy(graph).to(device))[:count]
-        alarmed = is_stuck(teams.positions, teams.goals, teams.past)
-        if self.config.taps > 1:  # with one tap robots do not communicate
-            alarmed |= hears_of(alarmed, graph[:count])
-        seeds = robot_seeds(teams.seeds, graph.shape[1])
-        return self.execution.values(logits.float().cpu().numpy(), alarmed, seeds, teams.time)
+    def env_settings(self) -> dict[str, Any]:
+        """Return what the policy's robots perceive and how they are shielded."""
+        return self.execution.env_settings(self.config)
 
-    def _tables(self, teams: Teams, chosen: Cases) -> npt.NDArray[np.uint16]:
-        """(B, N, size) distances to the goals of the chosen teams (B,), which stay as long as they are played."""
-        if not self._rows.keys() >= set(teams.cases.tolist()):
-            self._rows = {case: row for row, case in enumerate(teams.cases.tolist())}
-            self._distances = rules.distance_tables(teams.obstacles, self.border, teams.goals)
-        return self._distances[[self._rows[case] for case in teams.cases[chosen].tolist()]]
+    def act(self, env: BatchedEnv) -> npt.NDArray[Any]:
+        """Observe, communicate and score the moves."""
+        robots = env.present & env.running[:, None]
+        team, robot = np.nonzero(robots)
 
+        def noise(drawn: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
+            return gumbel(robot_seeds(env.seeds[team[drawn]], robot[drawn]), env.times[team[drawn]])
 
-def _padded_size(teams: int) -> int:
-    """The next of few batch sizes: the convolution library prepares itself anew for each size it meets."""
-    return 1 << (teams - 1).bit_length() if teams < 32 else -(-teams // 32) * 32
+        scores = np.zeros((*robots.shape, len(Action)), np.float32)
+        scores[robots] = scores_of(self.policy, env.bag(), self.execution, noise)
+        return scores if self.execution.shield != "idle" else scores.argmax(-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rollouts:
-    """What became of C teams."""
+    """The outcomes of C teams."""
 
     instances: list[Instance]
     """The C instances."""
     solutions: list[Solution]
-    """The executed paths, up to the first time that all robots were on their goals, or to max_steps."""
+    """The executed paths: up to the first time that all robots were on their goals, or to max_steps."""
+    goals: list[npt.NDArray[np.int32]]
+    """For each team (T + 1, N, 2), the robots' goals at each time of its path; (1, N, 2) where they never change."""
     success: npt.NDArray[np.bool_]
-    """(C,) all robots were on their goals at once within max_steps."""
+    """(C,) all robots were on their goals at once within max_steps; never in lifelong tasks."""
     flowtime: npt.NDArray[np.int64]
     """(C,) the sum over robots of the last arrival; a robot that is not on its goal at the end counts max_steps."""
     makespan: npt.NDArray[np.int64]
     """(C,) the last arrival of all; max_steps if the team failed."""
+    on_goal: npt.NDArray[np.float64]
+    """(C,) the share of robots that are on their goals at the end (ISR)."""
     latched: npt.NDArray[np.bool_]
-    """(C,) every robot touched its goal at least once (what the paper's released code counts as success)."""
+    """(C,) every robot touched its goal at least once (what the authors' code counts as success)."""
     replaced: npt.NDArray[np.float64]
     """(C,) the share of actions that the shield replaced."""
+    throughput: npt.NDArray[np.float64]
+    """(C,) arrivals of all robots a step."""
 
 
 def rollout(
     policy: nn.Module | Actor,
     instances: Sequence[Instance],
     *,
-    shield: Shield = "idle",
-    sample: Sample = False,
-    temperature: float = 1.0,
-    comm_range: CommRange | None = None,
-    comm_weights: CommWeights | None = None,
+    task: Task = "one_shot",
+    execution: Execution | None = None,
+    message_loss: float = 0.0,
     seed: int | Sequence[int] = 0,
     max_steps: int | Sequence[int] | npt.NDArray[np.integer] = 128,
     batch_size: int = 256,
 ) -> Rollouts:
     """Play `instances` under a policy and the collision shield; no expert is needed.
 
-    What becomes of a team depends on the policy, its instance, its seed and its max_steps alone: neither on its place
-    in the list nor on the others. So equal instances with equal seeds end equally.
+    Teams and maps of any sizes can be played in one call. The outcome of a team depends only on the policy, its
+    instance, its seed and its max_steps: not on its place in the list, and not on the other teams.
 
     Args:
-        policy: A policy; or a network of your own that maps views (B, N, C, F, F) and graphs (B, N, N) to logits
-            (B, N, 5) and has a `config`, a `PolicyConfig` that says what its robots perceive; or an `Actor` of your
-            own, which heeds nothing of how policies are executed but the shield.
-        instances: The problems; all with the same number of agents and maps of one size.
-        shield: As in `Execution`.
-        sample: As in `Execution`.
-        temperature: As in `Execution`.
-        comm_range: As in `Execution`.
-        comm_weights: As in `Execution`.
-        seed: Of the draws and of the shield's tie-breaking, one for all instances or one for each.
+        policy: A policy; or a network of your own that maps a bag of robots (`mapf_env.Bag`, as tensors) to logits
+            (M, 5) and has a `config`, a `PolicyConfig` that says what its robots perceive; or an `Actor`.
+        instances: The problems.
+        task: "one_shot", or "lifelong": a robot that arrives gets a new goal, until max_steps.
+        execution: How moves are chosen from logits, the shield and the radio; the policy's own (`policy.execution`) if
+            not given. An `Actor` brings its own settings.
+        message_loss: The probability that a link fails in a step.
+        seed: Seed of the draws and of the shield's tie-breaking, one for all instances or one for each.
         max_steps: T_max, one for all instances or one for each.
-        batch_size: How many teams are played at a time; it does not change the outcome.
+        batch_size: How many teams are played at a time, at most; it does not change the outcome.
 
     Raises:
-        ValueError: If the instances differ in size, an argument is out of range, or weights, logits or an actor's
-            values are not finite numbers.
-        TypeError: If `policy` is none of these.
+        ValueError: If an argument is out of range, or the policy needs more memory than there is for one team.
+        TypeError: If `policy` is neither a network nor an actor.
     """
     if not instances:
         raise ValueError("there are no instances to play")
-    execution = Execution(
-        sample=sample, temperature=temperature, shield=shield, comm_range=comm_range, comm_weights=comm_weights
-    )
-    sizes = {(each.num_agents, *each.grid.shape) for each in instances}
-    if len(sizes) > 1:
-        raise ValueError(f"all instances must have one team size and map size, got (agents, rows, columns) {sizes}")
     if batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {batch_size}")
     limits = np.array(_one_for_each("max_steps", max_steps, len(instances)), np.int64)
     if (limits < 1).any():
         raise ValueError(f"max_steps must be at least 1, got {limits.min()}")
     seeds = _seeds(instances, _one_for_each("seed", seed, len(instances)))
-    if isinstance(policy, Actor):
-        return _play_all(policy, instances, seeds, limits, shield, batch_size)
-    if not isinstance(policy, nn.Module):
-        raise TypeError(
-            f"rollout plays a network or an actor, got {type(policy).__name__}: an actor has `border`, `memory` and "
-            "`act` (gnn_policy.Actor)"
-        )
-    was_training = policy.training
+    actor = _actor(policy, execution)
+    settings = {**actor.env_settings(), "task": task, "message_loss": message_loss}
+    was_training = isinstance(policy, nn.Module) and policy.training
+    played: list[_Played | None] = [None] * len(instances)
     try:
-        return _play_all(PolicyActor(policy.eval(), instances, execution), instances, seeds, limits, shield, batch_size)
+        if isinstance(policy, nn.Module):
+            policy.eval()
+        for chosen in _batches(instances, batch_size, task):
+            outcomes = _play(actor, [instances[i] for i in chosen], seeds[chosen], limits[chosen], settings)
+            for i, outcome in zip(chosen, outcomes, strict=True):
+                played[i] = outcome
     finally:
-        policy.train(was_training)
+        if isinstance(policy, nn.Module):
+            policy.train(was_training)
+    return _judge(
+        list(instances), [each or _Played.at_once(i) for each, i in zip(played, instances, strict=True)], limits, task
+    )
+
+
+def _actor(policy: nn.Module | Actor, execution: Execution | None) -> Actor:
+    if isinstance(policy, nn.Module):
+        own: Execution = getattr(policy, "execution", Execution())
+        return PolicyActor(policy, own if execution is None else execution)
+    if not isinstance(policy, Actor):
+        raise TypeError(
+            f"rollout plays a network or an actor, got {type(policy).__name__}: an actor has `env_settings` and `act` "
+            "(gnn_policy.Actor)"
+        )
+    if execution is not None:
+        raise ValueError(f"{type(policy).__name__} is an actor and brings its own settings: leave execution out")
+    return policy
 
 
 def _one_for_each(name: str, given: int | Sequence[int] | npt.NDArray[np.integer], count: int) -> list[int]:
@@ -216,7 +181,7 @@ def _one_for_each(name: str, given: int | Sequence[int] | npt.NDArray[np.integer
 
 
 def _seeds(instances: Sequence[Instance], seeds: Sequence[int]) -> npt.NDArray[np.uint64]:
-    """(C,) a hash of each instance and its seed."""
+    """Return a hash (C,) of each instance and its seed."""
     wrong = [seed for seed in seeds if not 0 <= seed < 2**64]
     if wrong:
         raise ValueError(f"seed must lie in 0..2**64 - 1, got {wrong[0]}")
@@ -225,89 +190,122 @@ def _seeds(instances: Sequence[Instance], seeds: Sequence[int]) -> npt.NDArray[n
         for each in instances
     ]
     counters = np.array([int.from_bytes(each.digest()[:8], "little") for each in prints], np.uint64)
-    return _native.mix(np.array(seeds, np.uint64), counters)
+    return mix(np.array(seeds, np.uint64), counters)
 
 
-def _play_all(
-    actor: Actor,
-    instances: Sequence[Instance],
-    seeds: npt.NDArray[np.uint64],
-    limits: npt.NDArray[np.int64],
-    shield: Shield,
-    batch_size: int,
-) -> Rollouts:
-    parts = [
-        _play(actor, instances, np.arange(first, min(first + batch_size, len(instances))), seeds, limits, shield)
-        for first in range(0, len(instances), batch_size)
-    ]
-    solutions, replaced = [each for part, _ in parts for each in part], np.concatenate([each for _, each in parts])
-    return _judge(list(instances), solutions, limits, replaced)
+def _batches(instances: Sequence[Instance], batch_size: int, task: Task) -> Iterator[npt.NDArray[np.intp]]:
+    """Yield the numbers of instances to play side by side: of similar sizes, as arrays are as large as the largest.
+
+    Instances that are solved at the start are left out of one-shot tasks. In lifelong tasks the maps of a batch have
+    one size: new goals are drawn on the map as it is filled up.
+    """
+    areas = np.array([each.grid.size for each in instances])
+    heights = np.array([each.grid.shape[0] for each in instances])
+    robots = np.array([each.num_agents for each in instances])
+    open_ = [task == "lifelong" or not np.array_equal(each.starts, each.goals) for each in instances]
+    order = np.lexsort((robots, heights, areas))
+    order = order[np.array(open_)[order]]
+    first = 0
+    while first < len(order):
+        last = first + 1
+        most_robots = robots[order[first]]
+        while last < len(order) and last - first < batch_size:
+            most_robots = max(most_robots, robots[order[last]])
+            if task == "lifelong" and instances[order[last]].grid.shape != instances[order[first]].grid.shape:
+                break
+            if 2 * areas[order[last]] * most_robots * (last - first + 1) > _MOST_BYTES:
+                break
+            last += 1
+        yield order[first:last]
+        first = last
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Played:
+    """The run of one team of n robots over T steps."""
+
+    paths: npt.NDArray[np.int32]
+    """(T + 1, n, 2)"""
+    goals: npt.NDArray[np.int32]
+    """(T + 1, n, 2), or (1, n, 2) where they never change."""
+    replaced: int
+    """How many actions the shield replaced."""
+    arrivals: npt.NDArray[np.int64]
+    """(n,) how often each robot has moved onto its goal."""
+
+    @staticmethod
+    def at_once(instance: Instance) -> _Played:
+        """Return the run of a team that starts on its goals."""
+        return _Played(instance.starts[None], instance.goals[None], 0, np.zeros(instance.num_agents, np.int64))
 
 
 def _play(
     actor: Actor,
     instances: Sequence[Instance],
-    cases: Cases,
     seeds: npt.NDArray[np.uint64],
     limits: npt.NDArray[np.int64],
-    shield: Shield,
-) -> tuple[list[Solution], npt.NDArray[np.float64]]:
-    """Paths and the share of replaced actions of some cases."""
-    pad = actor.border
-    obstacles = rules.bordered(np.stack([instances[i].grid for i in cases]), pad)
-    goals = np.stack([instances[i].goals for i in cases])
-    positions = np.stack([instances[i].starts for i in cases])
-    under_way = np.zeros(positions.shape[:2], np.int32)
-    lengths, replaced = np.zeros(len(cases), np.int64), np.zeros(len(cases))
-    history = [positions]
-    active = np.flatnonzero((positions != goals).any(axis=(1, 2)))
-    while len(active):
-        time = len(history) - 1
-        here, maps, draws = positions[active], obstacles[active], seeds[cases[active]]
-        recent = history[max(time - actor.memory, 0) : time]
-        past = np.stack(recent)[:, active] if recent else np.empty((0, *here.shape), here.dtype)
-        wanted = actor.act(Teams(cases[active], draws, maps, here, goals[active], past, time))
-        if not np.isfinite(wanted).all():
+    settings: dict[str, Any],
+) -> list[_Played]:
+    """Play instances side by side until the last team has ended."""
+    lifelong = settings["task"] == "lifelong"
+    env = BatchedEnv(
+        len(instances),
+        fill=True,
+        num_agents=max(each.num_agents for each in instances),
+        height=max(each.grid.shape[0] for each in instances),
+        width=max(each.grid.shape[1] for each in instances),
+        style="empty",
+        **settings,
+    )
+    env.reset(seeds.tolist(), instances=instances, max_cycles=limits.tolist())
+    paths, goals = [env.positions], [env.goals]
+    steps, replaced = (np.zeros(len(instances), np.int64) for _ in range(2))
+    arrivals = np.zeros((len(instances), env.num_agents), np.int64)
+    while (running := env.running).any():
+        actions = actor.act(env)
+        if not np.isfinite(actions).all():
             raise ValueError(f"{type(actor).__name__}.act returned values that are not finite numbers")
-        times = np.full(len(active), time)
-        chosen = wanted.argmax(-1) if wanted.ndim == 3 else wanted
-        if shield == "pibt":
-            executed = rules.pibt_shield(maps, pad, here, wanted, under_way[active], draws, times)
-        else:
-            executed = rules.shield(maps, pad, here, chosen, draws, times)
-        positions = positions.copy()
-        positions[active] = rules.move(here, executed)
-        under_way = np.where((positions == goals).all(-1), 0, under_way + 1).astype(np.int32)
-        history.append(positions)
-        lengths[active] += 1
-        replaced[active] += (executed != chosen).mean(axis=1)
-        goes_on = (positions[active] != goals[active]).any(axis=(1, 2)) & (lengths[active] < limits[cases[active]])
-        active = active[goes_on]
-    paths = np.stack(history, axis=1)
-    solutions = [Solution(path[: length + 1]) for path, length in zip(paths, lengths, strict=True)]
-    return solutions, replaced / np.maximum(lengths, 1)
+        outcome = env.step(actions, observe=False)
+        paths.append(env.positions)
+        if lifelong:
+            goals.append(env.goals)
+        steps += running
+        replaced += np.where(running, outcome.replaced.sum(axis=1), 0)
+        arrivals += running[:, None] & outcome.arrived
+    all_paths, all_goals = np.stack(paths, axis=1), np.stack(goals, axis=1)
+    return [
+        _Played(
+            all_paths[b, : steps[b] + 1, : each.num_agents],
+            all_goals[b, : steps[b] + 1, : each.num_agents],
+            int(replaced[b]),
+            arrivals[b, : each.num_agents],
+        )
+        for b, each in enumerate(instances)
+    ]
 
 
-def _judge(
-    instances: list[Instance],
-    solutions: list[Solution],
-    limits: npt.NDArray[np.int64],
-    replaced: npt.NDArray[np.float64],
-) -> Rollouts:
-    success, flowtime, makespan, latched = [], [], [], []
-    for instance, solution, limit in zip(instances, solutions, limits, strict=True):
-        on_goal = (solution.paths == instance.goals).all(axis=2)
-        times = np.where(on_goal[-1], solution.arrivals, limit)
-        success.append(on_goal[-1].all())
+def _judge(instances: list[Instance], played: list[_Played], limits: npt.NDArray[np.int64], task: Task) -> Rollouts:
+    solutions = [Solution(each.paths) for each in played]
+    success, flowtime, makespan, share, latched = [], [], [], [], []
+    for run, solution, limit in zip(played, solutions, limits, strict=True):
+        on_goal = (run.paths == run.goals).all(axis=2)
+        times = np.where(on_goal[-1] & (task == "one_shot"), solution.arrivals, limit)
+        success.append(on_goal[-1].all() and task == "one_shot")
         flowtime.append(times.sum())
         makespan.append(times.max())
-        latched.append(on_goal.any(axis=0).all())
+        share.append(on_goal[-1].mean())
+        latched.append((on_goal[0] | (run.arrivals > 0)).all())
+    steps = np.array([max(len(run.paths) - 1, 1) for run in played])
+    robots = np.array([each.num_agents for each in instances])
     return Rollouts(
         instances,
         solutions,
+        [run.goals for run in played],
         np.array(success),
         np.array(flowtime, np.int64),
         np.array(makespan, np.int64),
+        np.array(share),
         np.array(latched),
-        replaced,
+        np.array([run.replaced for run in played]) / (steps * robots),
+        np.array([run.arrivals.sum() for run in played]) / steps,
     )

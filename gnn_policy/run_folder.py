@@ -7,7 +7,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from gnn_policy.config import TrainConfig
-from gnn_policy.results_file import read_tables
+from gnn_policy.results_file import read_tables, tables_of
 from mapf_env.files import remove_drafts
 
 RESULTS = "results.json"
@@ -44,9 +44,9 @@ def open_run(folder: Path, config: TrainConfig) -> None:
     check_run(folder, config)
     for each in (folder, folder / "demonstrations"):
         remove_drafts(each)
-    if not (folder / "config.json").exists():
+    if not (folder / "config.toml").exists():
         folder.mkdir(parents=True, exist_ok=True)
-        config.save(folder / "config.json")
+        config.save(folder / "config.toml")
 
 
 def check_run(folder: Path, config: TrainConfig) -> None:
@@ -59,9 +59,9 @@ def check_run(folder: Path, config: TrainConfig) -> None:
         return
     if folder.is_dir() and all(each.name.startswith(".") for each in folder.iterdir()):  # empty, or drafts at most
         return
-    if not (folder / "config.json").is_file():
+    if not (folder / "config.toml").is_file():
         raise FileExistsError(f"{folder} exists and is no training run: choose another folder with --run")
-    config.refuse_other(TrainConfig.load(folder / "config.json"), f"{folder} holds a run with", "--run")
+    config.refuse_other(TrainConfig.load(folder / "config.toml"), f"{folder} holds a run with", "--run")
     if (folder / RESULTS).exists():
         raise FileExistsError(
             f"{folder} holds a finished run: evaluate it with `python -m gnn_policy.evaluate {folder}`, "
@@ -75,7 +75,8 @@ def is_finished(folder: Path, config: TrainConfig) -> bool:
     Raises:
         FileExistsError: If the folder holds a run with other settings.
     """
-    if not (folder / "config.json").is_file() or config.num_agents not in read_tables(folder / RESULTS):
+    finished = read_tables(folder / RESULTS).keys()
+    if not (folder / "config.toml").is_file() or not tables_of(config, ()).keys() <= finished:
         return False
-    config.refuse_other(TrainConfig.load(folder / "config.json"), f"{folder} holds a run with", "--run")
+    config.refuse_other(TrainConfig.load(folder / "config.toml"), f"{folder} holds a run with", "--run")
     return True

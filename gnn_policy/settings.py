@@ -7,7 +7,7 @@ from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from mapf_env.arguments import choice, flag, integer, number
+from mapf_env.arguments import flag, integer, number
 
 
 def check_types(settings: Any) -> None:
@@ -35,7 +35,8 @@ def _check(value: Any, hint: Any, name: str) -> None:
         (hint,) = (part for part in parts if part is not NoneType)
         _check(value, hint, name)
     elif origin is Literal:
-        choice(value, parts, name)
+        if not any(value == part and type(value) is type(part) for part in parts):
+            raise ValueError(f"{name} must be one of {', '.join(map(str, parts))}, got {value!r}")
     elif origin is tuple:
         if not isinstance(value, tuple):
             raise TypeError(f"{name} must be a tuple, got {value!r}")

@@ -20,26 +20,27 @@ ACTIONS: npt.NDArray[np.int8] = np.array(
 """(8, 5) the action that each action becomes."""
 
 
-def symmetries(height: int, width: int) -> npt.NDArray[np.intp]:
-    """The symmetries that keep the map's shape: all eight of a square, four of a rectangle."""
-    return np.arange(8) if height == width else np.array([0, 2, 4, 6])
-
-
-def turn_maps(grids: npt.NDArray[Any], symmetry: int) -> npt.NDArray[Any]:
-    """Grids (..., H, W) under one symmetry of theirs."""
-    height, width = grids.shape[-2:]
-    rows, cols = np.mgrid[:height, :width]
-    turned = np.empty_like(grids)
-    cells = turn_cells(np.stack([rows, cols], -1), np.array(symmetry), height, width)
-    turned[..., cells[..., 0], cells[..., 1]] = grids
+def turn_map(grid: npt.NDArray[Any], symmetry: int) -> npt.NDArray[Any]:
+    """Return a grid (H, W) under one symmetry: (H, W), or (W, H) after a quarter turn."""
+    height, width = grid.shape
+    cells = np.moveaxis(np.indices((height, width)), 0, -1)
+    turned_cells = turn_cells(cells, np.array(symmetry), np.array([height, width]))
+    turned = np.empty((width, height) if symmetry % 2 else (height, width), grid.dtype)
+    turned[turned_cells[..., 0], turned_cells[..., 1]] = grid
     return turned
 
 
 def turn_cells(
-    cells: npt.NDArray[np.integer], symmetry: npt.NDArray[np.integer], height: int, width: int
+    cells: npt.NDArray[np.integer], symmetry: npt.NDArray[np.integer], shape: npt.NDArray[np.integer]
 ) -> npt.NDArray[np.int32]:
-    """Cells (..., 2) of a height x width map; `symmetry` is broadcast over their leading axes."""
+    """Return cells (..., 2) of maps under symmetries (...), where `shape` (..., 2) has the maps' heights and widths."""
     # Twice the difference to the centre of the map keeps the numbers whole.
-    centre = np.array([height - 1, width - 1])
-    turned = np.einsum("...ij,...j->...i", _TRANSFORMS[symmetry], 2 * cells - centre)
-    return ((turned + centre) // 2).astype(np.int32)
+    centre = shape.astype(np.int64) - 1
+    turned_centre = np.where((symmetry % 2 == 1)[..., None], centre[..., ::-1], centre)
+    turned = np.einsum("...ij,...j->...i", _TRANSFORMS[symmetry], 2 * cells.astype(np.int64) - centre)
+    return ((turned + turned_centre) // 2).astype(np.int32)
+
+
+def turn_actions(actions: npt.NDArray[np.integer], symmetry: npt.NDArray[np.integer]) -> npt.NDArray[np.int8]:
+    """Return actions (...) under symmetries (...); -1, where there is none, stays."""
+    return np.where(actions < 0, -1, ACTIONS[symmetry, actions]).astype(np.int8)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
 
+from gnn_policy import checkpoint
 from gnn_policy.command_line import run_command
 from gnn_policy.config import RECIPES, Recipe, TrainConfig
 from gnn_policy.cores import cpu_threads
-from gnn_policy.results_file import read_tables, settings_of, table_title, variants_of_training
+from gnn_policy.results_file import read_tables, settings_of, table_title, variants_of
 from gnn_policy.run_folder import RESULTS, check_run, is_finished
 
 if TYPE_CHECKING:
@@ -33,22 +34,36 @@ class Command:
     recipe: Recipe = "quick"
     """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "full" is
     that of the policies that come with the package, "paper" the paper's setup."""
+    file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
+    """A file of settings, such as the config.toml of another run, instead of a recipe; settings that are not there have
+    the defaults of "paper"."""
     run: Path | None = None
-    """The run folder; runs/RECIPE if not given."""
+    """The run folder; runs/RECIPE, or runs/ and the name of the file of settings, if not given."""
     debug: bool = False
     """Print the traceback of an error."""
 
 
 @dataclass(frozen=True)
-class _RecipeOnly:
+class _Defaults:
     recipe: Recipe = "quick"
+    file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    init: str | None = None
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """The command that the arguments ask for; the recipe among them decides the defaults of the rest."""
-    chosen, _ = tyro.cli(_RecipeOnly, args=arguments, return_unknown_args=True, add_help=False)
-    defaults = Command(RECIPES[chosen.recipe], chosen.recipe)
-    return tyro.cli(Command, args=arguments, default=defaults, prog="python -m gnn_policy.train")
+    """Return the command that the arguments ask for.
+
+    The recipe or the file of settings among them decides the other defaults; a policy to start from decides the
+    network, its senses and its execution.
+    """
+    chosen, _ = tyro.cli(_Defaults, args=arguments, return_unknown_args=True, add_help=False)
+    config = RECIPES[chosen.recipe] if chosen.file is None else TrainConfig.load(chosen.file)
+    init = config.init if chosen.init is None else chosen.init
+    if init is not None:
+        config = replace(config, policy=checkpoint.config_of(init), execution=checkpoint.executed_as(init))
+    return tyro.cli(
+        Command, args=arguments, default=Command(config, chosen.recipe, chosen.file), prog="python -m gnn_policy.train"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -58,7 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _start(command: Command) -> None:
     """Refuse what can be refused without torch, then join the other processes and train."""
-    config, folder = command.config, command.run or Path("runs", command.recipe)
+    name = command.recipe if command.file is None else command.file.stem
+    config, folder = command.config, command.run or Path("runs", name)
     cpu_threads(config.threads)
     if int(os.environ.get("RANK", "0")) == 0:
         if is_finished(folder, config):
@@ -72,11 +88,12 @@ def _start(command: Command) -> None:
 
 
 def _show_finished(folder: Path, config: TrainConfig) -> None:
-    from gnn_policy.evaluation import table
+    from gnn_policy.evaluation import lifelong_table, table
 
-    console, settings = Console(), settings_of(config, (), variants_of_training(config), "test")
-    for num_agents, result in read_tables(folder / RESULTS).items():
-        console.print(table(table_title(num_agents, settings), result))
+    console, settings = Console(), settings_of(config, (), variants_of(config.execution), "test", config.task)
+    show = table if config.task == "one_shot" else lifelong_table
+    for name, result in read_tables(folder / RESULTS).items():
+        console.print(show(table_title(name, settings), result))
     console.print(
         f"{folder} holds a finished run: choose another folder with --run to train again",
         highlight=False,
@@ -85,7 +102,6 @@ def _show_finished(folder: Path, config: TrainConfig) -> None:
 
 
 def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) -> None:
-    from gnn_policy import checkpoint
     from gnn_policy.command_line import on_device
     from gnn_policy.examination import examine
     from gnn_policy.progress import TrainingProgress
@@ -107,7 +123,7 @@ def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) ->
             return
         # The command line, which the run's settings agree with, has asked for its parts.
         policy = checkpoint.load(folder, plugins=tuple(config.policy.plugins.values()))
-        examine(on_device(policy, config.device), config, folder, console, threads=training.threads)
+        examine(on_device(policy, config.device), config, folder, console, task=config.task, threads=training.threads)
     console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
     console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)
 

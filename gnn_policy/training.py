@@ -1,7 +1,7 @@
 """The one training loop: collect, label, aggregate, fit, validate; round after round, resumable after each.
 
 A run folder holds
-    config.json                  the settings
+    config.toml                  the settings
     demonstrations/round_*.safetensors  labelled states, one file for each round of collection
     state.pt                     all that the next round needs, replaced as a whole after each round
     best.safetensors             the policy of the best validation so far
@@ -33,15 +33,14 @@ from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
 from gnn_policy import checkpoint, evaluation
-from gnn_policy.cases import Split, make_cases
 from gnn_policy.command_line import on_device
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
-from gnn_policy.dagger import Aggregator, Teacher, teams_side_by_side
+from gnn_policy.dagger import Demonstrator, teams_side_by_side
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.finite import require_finite
 from gnn_policy.half_batches import HalfBatches
-from gnn_policy.imitation import ImitationLoss
+from gnn_policy.imitation import EXPERT_ACTION, ImitationLoss
 from gnn_policy.learning_curve import Round, draw_learning_curve
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
@@ -49,24 +48,8 @@ from gnn_policy.progress import TrainingProgress
 from gnn_policy.ranks import Ranks
 from gnn_policy.rollout import rollout
 from gnn_policy.run_folder import lock_run, open_run
-from mapf_env import Instance
+from gnn_policy.teacher import Teacher
 from mapf_env.files import replacing
-
-
-def split_cases(config: TrainConfig, split: Split, num_agents: int | None = None) -> list[Instance]:
-    """The cases of one split as the settings define them."""
-    maps, cases = config.size_of(split)
-    return make_cases(
-        split,
-        seed=config.data_seed,
-        maps=maps,
-        cases_per_map=cases,
-        num_agents=config.num_agents if num_agents is None else num_agents,
-        height=config.height,
-        width=config.width,
-        density=config.density,
-        styles=config.styles,
-    )
 
 
 class Training:
@@ -101,7 +84,9 @@ class Training:
         self.threads = cpu_threads(config.threads, ranks.local_count)
         torch.set_num_threads(self.threads)
         torch.manual_seed(config.seed)
-        self.policy = on_device(DecentralizedPolicy(config.policy), config.device)
+        self.policy = on_device(DecentralizedPolicy(config.policy, config.execution), config.device)
+        if config.init is not None:
+            _start_from(self.policy, config)
         self.loss = ImitationLoss(ranks.average_gradients(self.policy))
         alone = ranks.count == 1 and self.policy.head.weight.device.type == "cpu"
         self._halves = HalfBatches(self.policy, self.loss, config.precision, self.threads) if alone else None
@@ -116,10 +101,10 @@ class Training:
         self.history: list[Round] = []
         self._seconds_before = 0.0
         self._clock, self._began = clock, clock()
-        self._instances = split_cases(config, "train")
-        self._validation = split_cases(config, "validation")
+        self._cases = config.cases("train")
+        self._validation = config.cases("validation").instances
         self._teacher = Teacher(
-            self._instances,
+            self._cases.grids,
             solver=config.teacher,
             w=config.w,
             robot_order=config.robot_order,
@@ -154,14 +139,14 @@ class Training:
             if first
             else None
         )
-        batches = BatchMaker(self._instances, config.policy, augment=config.augment)
-        aggregator = Aggregator(config, self.policy, self._teacher, self._instances, self.ranks)
+        batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
+        demonstrator = Demonstrator(config, self.policy, self._teacher, self._cases, self.ranks)
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
             for number in range(len(self.history), config.epochs):
-                row = self._round(number, aggregator, batches, exam)
+                row = self._round(number, demonstrator, batches, exam)
                 self.history.append(row)
                 if writer is not None:
                     for name, value in asdict(row).items():
@@ -172,7 +157,7 @@ class Training:
                 self.progress.finished(row)
         finally:
             torch.set_flush_denormal(False)
-            aggregator.close()
+            demonstrator.close()
             if self._halves is not None:
                 self._halves.close()
             torch.set_num_threads(self.threads)  # and give back more than they took
@@ -180,13 +165,15 @@ class Training:
                 writer.close()
                 self._lock.release()
 
-    def _round(self, number: int, aggregator: Aggregator, batches: BatchMaker, exam: evaluation.Exam | None) -> Round:
+    def _round(
+        self, number: int, demonstrator: Demonstrator, batches: BatchMaker, exam: evaluation.Exam | None
+    ) -> Round:
         config = self.config
         began, taught, unlabelled = self._clock(), self._teacher.seconds, 0
         if self._collects(number):
             self.progress.phase(number, "collecting")
             steps = config.dagger_steps if number else config.demonstration_steps
-            shares = self.ranks.gather(aggregator.collect(number, steps))
+            shares = self.ranks.gather(demonstrator.collect(number, steps))
             collected = Demonstrations.concatenate([share for share, _ in shares])
             unlabelled = sum(count for _, count in shares)
             if self.ranks.rank == 0:
@@ -238,34 +225,38 @@ class Training:
         draws = self._pass(demonstrations, rng) if config.updates_per_epoch is None else self._draw(demonstrations, rng)
         updates = len(draws)
         self.policy.train()
-        losses, accuracies = np.zeros(updates), np.zeros(updates)
-        robots = config.batch_size * config.num_agents
-        for update, chosen in enumerate(draws):
-            own = chosen[self.ranks.rank :: self.ranks.count]
-            batch = batches.batch(demonstrations, own, rng).to(config.device)
-            losses[update], accuracies[update] = self._backward(batch)
+        figures = torch.zeros(updates, 2, device=self.policy.head.weight.device)  # which stay there for a round
+        robots = 0
+        own = [chosen[self.ranks.rank :: self.ranks.count] for chosen in draws]
+        halves = 1 if self._halves is None else 2
+        for update, parts in enumerate(batches.prefetched(demonstrations, own, rng, halves)):
+            figures[update] = self._backward([part.to(figures.device) for part in parts])
             self.optimizer.step()
-            if not np.isfinite(losses[update]):
-                raise self._diverged(number, "the loss is not a finite number")
-            self.progress.fitted(number, update + 1, updates, losses[: update + 1], robots)
+            robots += sum(len(part[EXPERT_ACTION]) for part in parts)
+            if self.progress.due() or update + 1 == updates:
+                losses = figures[: update + 1, 0].cpu().numpy()
+                if not np.isfinite(losses).all():
+                    raise self._diverged(number, "the loss is not a finite number")
+                self.progress.fitted(number, update + 1, updates, losses, robots)
         if self.ranks.count > 1:  # the last batch's statistics are each process's own
             self.policy.load_state_dict(self.ranks.from_first(self.policy.state_dict()))
         try:
             self._require_finite()
         except ValueError as damage:
             raise self._diverged(number, str(damage)) from damage
-        means = self.ranks.average(torch.tensor([losses.mean(), accuracies.mean()])).tolist()
-        return means[0], means[1], updates, sum(map(len, draws)) * config.num_agents
+        means = self.ranks.average(figures.mean(dim=0).cpu()).tolist()
+        return means[0], means[1], updates, sum(self.ranks.gather(robots))
 
-    def _backward(self, batch: TensorDict) -> tuple[float, float]:
-        """Set the gradients; return loss and accuracy of the batch."""
+    def _backward(self, parts: list[TensorDict]) -> torch.Tensor:
+        """Set the gradients; return the loss and accuracy (2,) of the batch."""
         if self._halves is not None:
-            return self._halves.backward(batch)
+            return self._halves.backward(parts)
+        (batch,) = parts
         with autocast(self.config.precision, self.policy.head.weight.device):
             outcome = self.loss(batch)
         self.optimizer.zero_grad()
         outcome["loss_imitation"].backward()
-        return outcome["loss_imitation"].item(), outcome["accuracy"].item()
+        return torch.stack([outcome["loss_imitation"].detach(), outcome["accuracy"]])
 
     def _require_finite(self) -> None:
         """Check the weights, the batch statistics and the optimiser's moments."""
@@ -299,20 +290,24 @@ class Training:
         played = rollout(
             self.policy,
             exam.instances,
-            shield=self.config.shield,
+            task=self.config.task,
+            execution=self.config.rollout_execution,
             max_steps=exam.max_steps,
             seed=self.config.seed,
         )
-        result = evaluation.score("validation", exam, played)
-        row.validation_success = result.success_rate.mean
-        row.validation_flowtime_increase = result.flowtime_increase.mean
-        best = [each for each in self.history if each.validation_success is not None]
+        if self.config.task == "lifelong":
+            row.validation_throughput = float(played.throughput.mean())
+        else:
+            result = evaluation.score("validation", exam, played)
+            row.validation_success = result.success_rate.mean
+            row.validation_flowtime_increase = result.flowtime_increase.mean
+        best = [each for each in self.history if each.validation is not None]
         if all(self._merit(row) > self._merit(each) for each in best):
-            checkpoint.save(self.policy, self.folder / "best.safetensors", training=self.config.to_json())
+            checkpoint.save(self.policy, self.folder / "best.safetensors", training=self.config.to_toml())
 
     @staticmethod
     def _merit(row: Round) -> tuple[float, float]:
-        return row.validation_success or 0.0, -(row.validation_flowtime_increase or 0.0)
+        return row.validation or 0.0, -(row.validation_flowtime_increase or 0.0)
 
     def _shard(self, number: int) -> Path:
         return self.folder / "demonstrations" / f"round_{number:04d}.safetensors"
@@ -330,7 +325,7 @@ class Training:
             table = csv.DictWriter(file, list(asdict(self.history[0])))
             table.writeheader()
             table.writerows(state["history"])
-        if self.history[-1].validation_success is not None:
+        if self.history[-1].validation is not None:
             with replacing(self.folder / "learning_curve.png") as draft:
                 draw_learning_curve(self.history, draft)
         with replacing(self.folder / "state.pt") as draft:
@@ -370,3 +365,17 @@ class Training:
         return ValueError(
             f"{self.folder / 'state.pt'} is damaged ({why}): choose another folder with --run, or delete this one"
         )
+
+
+def _start_from(policy: DecentralizedPolicy, config: TrainConfig) -> None:
+    """Give a policy the weights that the settings name.
+
+    Raises:
+        ValueError: If they belong to another network or other senses.
+    """
+    given = checkpoint.load(config.init or "", plugins=tuple(config.policy.plugins.values()))
+    if given.config != config.policy:
+        own, others = asdict(config.policy), asdict(given.config)
+        differ = ", ".join(f"{name}: {others[name]!r}, not {own[name]!r}" for name in own if own[name] != others[name])
+        raise ValueError(f"the policy {config.init} is another network than the one to train ({differ})")
+    policy.load_state_dict(given.state_dict())

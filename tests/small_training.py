@@ -1,8 +1,10 @@
-"""Settings of a training that takes a second."""
+"""Settings of trainings that take a second."""
 
-from dataclasses import asdict
+from dataclasses import replace
+from pathlib import Path
 
 from gnn_policy import PolicyConfig
+from gnn_policy.cases import Family
 from gnn_policy.config import TrainConfig
 
 CONFIG = TrainConfig(
@@ -28,17 +30,22 @@ CONFIG = TrainConfig(
 )
 
 
+MIXED = replace(
+    CONFIG,
+    families=(
+        Family(height=(6, 8), width=(6, 9), num_agents=(2, 5), density=(0.0, 0.2)),
+        Family(
+            style="maze", share=0.5, height=(7, 9), width=(9, 9), num_agents=(3, 4), corridor_width=(1, 2), loops=(0, 1)
+        ),
+    ),
+    augment=True,
+)
+"""Two families of cases of mixed sizes."""
+
+
 def arguments_for(config, folder):
-    """The command line that asks for `config`."""
-    flags = ["--run", str(folder)]
-    for name, value in asdict(config).items():
-        for option, setting in (
-            [(f"policy.{each}", v) for each, v in value.items()] if name == "policy" else [(name, value)]
-        ):
-            *group, last = option.replace("_", "-").split(".")
-            if isinstance(setting, bool):
-                flags.append("--" + ".".join([*group, last if setting else f"no-{last}"]))
-            else:
-                flags.append("--" + ".".join([*group, last]))
-                flags += map(str, setting if isinstance(setting, tuple) else (setting,))
-    return flags
+    """Write a file of settings next to the run folder; return the command line that asks for it."""
+    file = Path(folder).with_suffix(".toml")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    config.save(file)
+    return ["--config", str(file), "--run", str(folder)]

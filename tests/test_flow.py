@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def test_training_leaves_all_that_it_promises(trained: tuple[Path, "subprocess.C
     assert sorted(each.name for each in run.iterdir()) == [
         "animation.svg",
         "best.safetensors",
-        "config.json",
+        "config.toml",
         "demonstrations",
         "learning_curve.png",
         "metrics.csv",
@@ -51,7 +52,7 @@ def test_training_leaves_all_that_it_promises(trained: tuple[Path, "subprocess.C
         "state.pt",
         "tensorboard",
     ]
-    assert json.loads((run / "config.json").read_text())["policy"]["features"] == 16
+    assert tomllib.loads((run / "config.toml").read_text())["policy"]["features"] == 16
     assert sorted(each.name for each in (run / "demonstrations").iterdir()) == [
         f"round_{number:04d}.safetensors" for number in range(4)
     ]
@@ -69,7 +70,7 @@ def test_training_leaves_all_that_it_promises(trained: tuple[Path, "subprocess.C
 
 
 def test_the_results_make_sense(trained: tuple[Path, "subprocess.CompletedProcess[str]"]) -> None:
-    (table,) = json.loads((trained[0] / "runs" / "quick" / "results.json").read_text())["num_agents"].values()
+    (table,) = json.loads((trained[0] / "runs" / "quick" / "results.json").read_text())["tables"].values()
     assert table["cases"] + table["unsolved_by_expert"] == 20
     argmax, stuck, sampled, random, greedy, restless, pibt, expert = table["rows"]
     assert expert["success_rate"]["mean"] == 1

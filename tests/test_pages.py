@@ -129,7 +129,13 @@ def test_commands_in_the_text_name_scripts_and_options_that_exist(page: str) -> 
         beside = [
             (ROOT / script).with_name(f"{name}.py") for name in imported((ROOT / script).read_text(encoding="utf-8"))
         ]
-        sources = [ROOT / script, ROOT / "gnn_policy" / "config.py", ROOT / "gnn_policy" / "network.py"]
+        settings = (
+            "gnn_policy/config.py",
+            "gnn_policy/policy_config.py",
+            "gnn_policy/execution.py",
+            "mapf_env/senses.py",
+        )
+        sources = [ROOT / script, *(ROOT / file for file in settings)]
         sources += [each for each in beside if each.is_file()]
         text = "".join(source.read_text(encoding="utf-8") for source in sources)
         for option in options:

@@ -82,7 +82,7 @@ def test_runs_of_other_settings_are_no_part_of_the_table(ablation: ModuleType, t
 def test_every_variant_is_a_setting_of_its_own(ablation: ModuleType, ablation_name: str) -> None:
     variants = getattr(ablation, ablation_name)
     configs = [replace(ablation.BASE, **settings) for settings in variants.values()]
-    assert len({each.to_json() for each in configs}) == len(configs)
+    assert len({each.to_toml() for each in configs}) == len(configs)
     assert len({ablation.run_folder(Path(), name, 0) for name in variants}) == len(configs)
     assert configs[0] == ablation.BASE
 

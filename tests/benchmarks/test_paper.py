@@ -11,9 +11,10 @@ import paper
 import paper_experiment
 from gnn_policy import DecentralizedPolicy, load, save
 from gnn_policy.checkpoint import fingerprint
-from gnn_policy.config import RECIPES
+from gnn_policy.config import RECIPES, TrainConfig
 from gnn_policy.progress import TrainingProgress
-from gnn_policy.training import Training, lock_run
+from gnn_policy.run_folder import lock_run
+from gnn_policy.training import Training
 from paper_experiment import Experiment, Model, Options, Scene
 from paper_figures import draw, success_rates, tables
 from small_training import CONFIG
@@ -98,7 +99,7 @@ def test_only_what_is_missing_is_trained_and_a_training_that_was_stopped_goes_on
     paper.train(whole, Console(quiet=True))
     assert whole.is_trained(Model(12, 3))
     assert (run / "metrics.csv").read_text().startswith(first)
-    assert json.loads((run / "config.json").read_text())["num_agents"] == 12
+    assert TrainConfig.load(run / "config.toml").num_agents == 12
     assert {each.name for each in tmp_path.iterdir() if each.is_dir()} == {"n4-k3", "n12-k3", "results"}
 
 
@@ -151,7 +152,7 @@ def test_what_no_model_has_is_refused(tmp_path):
 def test_a_model_of_other_settings_is_refused(tmp_path, monkeypatch):
     whole = experiment(tmp_path)
     finish(whole, Model(4, 3))
-    replace(Model(4, 3).config, density=0.3, threads=7).save(whole.run_of(Model(4, 3)) / "config.json")
+    replace(Model(4, 3).config, density=0.3, threads=7).save(whole.run_of(Model(4, 3)) / "config.toml")
     for action in (whole.untrained, lambda: whole.policy_of(Model(4, 3))):
         with pytest.raises(FileExistsError, match=r"n4-k3 holds a model of other settings \(density\)"):
             action()

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from gnn_policy.config import TrainConfig
+
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "report.py"
 
 
@@ -21,7 +23,7 @@ def run(tmp_path: Path) -> Path:
     """A run folder as training and evaluation leave it."""
     folder = tmp_path / "run<1>"
     (folder / "evaluation").mkdir(parents=True)
-    (folder / "config.json").write_text(json.dumps({"num_agents": 10}))
+    TrainConfig(num_agents=10).save(folder / "config.toml")
     (folder / "metrics.csv").write_text(
         "round,samples,loss,validation_success\n0,1000000,1.5,\n1,2000000,0.9,0.61\n2,3000000,0.7,0.83\n"
     )
@@ -42,7 +44,7 @@ def run(tmp_path: Path) -> Path:
     }
     settings = {"maps": 3, "split": "test", "styles": ["cells", "walls"], "height": 20, "width": 20}
     settings |= {"cases_per_map": 30, "w": 1.1, "timeout": 3.0}
-    (folder / "evaluation" / "results.json").write_text(json.dumps({"settings": settings, "num_agents": tables}))
+    (folder / "evaluation" / "results.json").write_text(json.dumps({"settings": settings, "tables": tables}))
     (folder / "evaluation" / "failures.html").write_text("<!doctype html><p>\"worst\" & 'cases'</p>")
     return folder
 
@@ -68,7 +70,7 @@ def test_the_page_has_curves_tables_replays_and_speed(run: Path, tmp_path: Path)
 
 
 def test_a_model_of_the_papers_experiment_shows_what_it_was_tested_on(run: Path, tmp_path: Path) -> None:
-    tables = json.loads((run / "evaluation" / "results.json").read_text())["num_agents"]
+    tables = json.loads((run / "evaluation" / "results.json").read_text())["tables"]
     for N, success in ((6, 0.625), (14, 0.375)):
         table = tables["10"]
         table["rows"][0]["success_rate"] = estimate(success)

@@ -4,27 +4,32 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from dataclasses import asdict
 from types import ModuleType
 
 import numpy as np
 import pytest
 import safetensors.torch
+import tomli_w
 import torch
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, Robot, checkpoint, evaluate, load, play, save
+from bags import random_bag
+from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, checkpoint, evaluate, load, play, rollout, save
 from gnn_policy.config import TrainConfig
-from mapf_env import save_map
+from mapf_env import random_instance, save_map
 from own_layers import Deaf
 
 CONFIG = PolicyConfig(encoder="lean", features=8, taps=2, fov_radius=3, comm_radius=4.5)
+
+EXECUTION = Execution(sample=True, temperature=0.5, shield="pibt", comm_range="connected", comm_weights="distance")
 
 
 @pytest.fixture
 def policy():
     torch.manual_seed(0)
-    policy = DecentralizedPolicy(CONFIG)
-    policy(torch.rand(2, 3, 3, 9, 9), torch.zeros(2, 3, 3))  # batch statistics that differ from their initial values
+    policy = DecentralizedPolicy(CONFIG, EXECUTION)
+    policy(random_bag(np.random.default_rng(0), [3, 3], CONFIG))  # batch statistics that differ from their first values
     return policy.eval()
 
 
@@ -36,13 +41,14 @@ def file(policy, tmp_path):
 
 def test_a_policy_returns_as_it_was_saved(policy, file):
     again = load(file)
-    assert again.config == CONFIG
+    assert (again.config, again.execution) == (CONFIG, EXECUTION)
+    assert checkpoint.executed_as(file) == EXECUTION
     assert not again.training
     assert again.state_dict().keys() == policy.state_dict().keys()
     for name, tensor in policy.state_dict().items():
         assert torch.equal(again.state_dict()[name], tensor), name
-    views, graph = torch.rand(2, 4, 3, 9, 9), torch.ones(2, 4, 4)
-    assert torch.equal(again(views, graph), policy(views, graph))
+    bag = random_bag(np.random.default_rng(1), [4, 1, 7], CONFIG)
+    assert torch.equal(again(bag), policy(bag))
     assert checkpoint.about(file)["command"] == "train me"
 
 
@@ -53,10 +59,8 @@ def test_a_part_of_ones_own_returns_where_it_can_be_imported(tmp_path, monkeypat
         patch.setitem(sys.modules, "my_parts", module)
         policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, graph_layer="my_parts:Own")).eval()
         save(policy, file)
-        views, graph = torch.rand(2, 4, 3, 11, 11), torch.ones(2, 4, 4)
-        assert torch.equal(load(file, plugins={"my_parts:Own"})(views, graph), policy(views, graph))
-        with pytest.raises(ValueError, match=r"messages of a graph filter, but .* has the graph layer 'my_parts:Own'"):
-            Robot(policy)
+        bag = random_bag(np.random.default_rng(1), [4, 2], policy.config)
+        assert torch.equal(load(file, plugins={"my_parts:Own"})(bag), policy(bag))
     with pytest.raises(checkpoint.CheckpointError, match="'my_parts:Own' cannot be found"):
         load(file, plugins=("my_parts:Own",))
 
@@ -132,7 +136,7 @@ def damage(file, how):
         case "foreign":
             file.write_bytes(safetensors.torch.save({"weight": torch.zeros(3)}))
         case "later format":
-            with_metadata(file, format="mapf-env policy 2")
+            with_metadata(file, format="mapf-env policy 3")
         case "without settings":
             file.write_bytes(safetensors.torch.save(safetensors.torch.load(content), {"format": checkpoint.FORMAT}))
         case "settings are no JSON":
@@ -143,6 +147,15 @@ def damage(file, how):
             with_metadata(file, policy=json.dumps({**settings, "layers": 7}))
         case "bad setting":
             with_metadata(file, policy=json.dumps({**settings, "taps": 0}))
+        case "without execution":
+            notes = {name: value for name, value in checkpoint.about(file).items() if name != "execution"}
+            file.write_bytes(safetensors.torch.save(safetensors.torch.load(content), notes))
+        case "execution is no table":
+            with_metadata(file, execution="[1]")
+        case "unknown execution":
+            with_metadata(file, execution=json.dumps({"patience": 2}))
+        case "bad execution":
+            with_metadata(file, execution=json.dumps({"shield": "none"}))
         case "other size":
             with_metadata(file, policy=json.dumps({**settings, "features": 16}))
         case "other encoder":
@@ -169,6 +182,10 @@ DAMAGES = [
     "settings are no table",
     "unknown setting",
     "bad setting",
+    "without execution",
+    "execution is no table",
+    "unknown execution",
+    "bad execution",
     "other size",
     "other encoder",
     "missing weights",
@@ -272,7 +289,7 @@ def test_a_module_that_fails_when_it_is_imported_is_an_error_in_one_line(tmp_pat
         {"taps": 2**31 - 1},
         {"fov_radius": 10_000},
         {"fov_radius": 2**31 - 1},
-        {"cost_to_go": True},
+        {"extra_channels": ["cost_to_go"]},
         {"encoder": "released", "features": 25_000},
     ],
 )
@@ -296,7 +313,10 @@ def test_sizes_in_a_file_are_compared_with_its_tensors_before_memory_is_allocate
         ("comm_radius", ["4", None, True, -1, float("nan")]),
         ("comm_range", [5, None, "far", []]),
         ("comm_weights", [5, None, "heavy"]),
-        ("cost_to_go", [0, 1, "true", None]),
+        ("extra_channels", [1, None, ["smell"], [3], ["cost_to_go", "cost_to_go"]]),
+        ("robot_features", [None, ["name"]]),
+        ("edge_features", [True, ["distance"]]),
+        ("memory", ["4", 0, 17, None]),
     ],
 )
 def test_settings_of_a_wrong_type_or_range_are_refused_in_one_line_that_names_them(file, capsys, name, values):
@@ -327,13 +347,14 @@ def test_settings_that_are_no_settings_are_refused(file, text, capsys):
 def test_newer_training_settings_stop_neither_play_nor_evaluation(file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_map("own.map", np.zeros((4, 4), bool))
-    settings = {**json.loads(TrainConfig(policy=CONFIG, test_maps=3).to_json()), "momentum": [0.9], "shield": "pibt"}
-    settings["policy"]["dilation"] = 2
-    with_metadata(file, training=json.dumps(settings))
-    assert checkpoint.trained_with(file) == TrainConfig(policy=CONFIG, test_maps=3, shield="pibt")
+    trained = TrainConfig(policy=CONFIG, test_maps=3, execution=Execution(shield="pibt"))
+    settings = tomllib.loads(trained.to_toml()) | {"momentum": [0.9]}
+    settings["policy"]["dilation"] = settings["execution"]["patience"] = 2  # pyright: ignore[reportArgumentType, reportCallIssue]
+    with_metadata(file, training=tomli_w.dumps(settings))
+    assert checkpoint.trained_with(file) == trained
     play.main(["own.map", "--agents", "2", "--run", str(file), "--max-steps", "3"])
     settings["styles"], settings["height"] = ["forest"], "tall"
-    with_metadata(file, training=json.dumps(settings))
+    with_metadata(file, training=tomli_w.dumps(settings))
     assert load(file).config == CONFIG
     play.main(["own.map", "--agents", "2", "--run", str(file), "--max-steps", "3", "--out", "second.html"])
     assert (tmp_path / "second.html").exists()
@@ -356,3 +377,23 @@ def test_the_same_weights_make_the_same_file(policy, tmp_path):
     for name in ("three", "four"):
         subprocess.run([sys.executable, "-c", program, str(tmp_path / "one"), str(tmp_path / name)], check=True)
         assert (tmp_path / name).read_bytes() == (tmp_path / "one").read_bytes()
+
+
+def test_a_policy_is_rolled_out_as_its_file_says_unless_a_caller_says_otherwise(file):
+    policy, cases = load(file), [random_instance(height=8, width=8, num_agents=6, seed=seed) for seed in range(3)]
+
+    def paths(**how):
+        return [each.paths.tolist() for each in rollout(policy, cases, max_steps=12, **how).solutions]
+
+    assert paths() == paths(execution=EXECUTION)
+    assert paths() != paths(execution=Execution())
+    assert policy.env_settings() == EXECUTION.env_settings(CONFIG)
+
+
+def test_the_packaged_policies_say_how_they_are_executed():
+    for file in checkpoint.WEIGHTS.glob("*.safetensors"):
+        trained, execution = checkpoint.trained_with(file), checkpoint.executed_as(file)
+        assert load(file).execution == execution
+        assert execution == Execution(sample="stuck", shield="pibt" if file.stem == "n12-informed" else "idle")
+        assert trained.execution == execution
+        assert trained.policy == load(file).config

@@ -2,10 +2,16 @@
 
 from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from gnn_policy import PolicyConfig
+from gnn_policy import Execution, PolicyConfig
+from gnn_policy.cases import Family, make_cases
 from gnn_policy.config import RECIPES, TrainConfig
+from mapf_env import save_map
+from small_training import CONFIG, MIXED
 
 
 @pytest.mark.parametrize(
@@ -44,22 +50,175 @@ def test_an_epoch_of_the_paper_is_a_pass_over_the_data():
     assert RECIPES["paper"].updates_per_epoch is None
 
 
-def test_settings_return_from_their_file(tmp_path):
-    config = replace(
-        RECIPES["quick"], policy=PolicyConfig(taps=2, comm_radius=7.5), lr=3e-4, seed=2**40, updates_per_epoch=None
+EXAMPLES = {
+    **RECIPES,
+    "changed": replace(
+        RECIPES["quick"],
+        policy=PolicyConfig(
+            taps=2,
+            comm_radius=7.5,
+            extra_channels=("cost_to_go", "other_goals"),
+            robot_features=("on_goal", "last_moves"),
+            edge_features=("relative_position", "priority"),
+            graph_layer="attention",
+            memory=3,
+        ),
+        execution=Execution(sample=True, temperature=0.1 + 0.2, shield="pibt", comm_range="connected"),
+        sample_rollouts="stuck",
+        styles=("walls", "maze"),
+        files=('C:\\maps\\"odd" ü.map', "two"),
+        init="n12",
+        lr=3e-4,
+        seed=2**40,
+        updates_per_epoch=None,
+    ),
+    "families": MIXED,
+    "sample": replace(TrainConfig(), sample_rollouts=True, execution=Execution(sample=False), weight_decay=1e-300),
+}
+
+
+@pytest.mark.parametrize("config", EXAMPLES.values(), ids=EXAMPLES)
+def test_settings_return_from_their_file(tmp_path, config):
+    config.save(tmp_path / "config.toml")
+    assert TrainConfig.load(tmp_path / "config.toml") == config
+    assert TrainConfig.from_toml(config.to_toml()).to_toml() == config.to_toml()
+
+
+@given(
+    lr=st.floats(1e-300, 1e300),
+    density=st.floats(0, 1),
+    radius=st.floats(0, 1e6),
+    seed=st.integers(0, 2**63 - 1),
+    shares=st.lists(st.floats(1e-9, 1e9), max_size=3),
+    file=st.text(st.characters(exclude_categories=("Cs",)), min_size=1),
+)
+def test_any_numbers_and_texts_return_from_toml(lr, density, radius, seed, shares, file):
+    config = TrainConfig(
+        policy=PolicyConfig(comm_radius=radius),
+        families=tuple(Family(share=share, density=(0, density)) for share in shares),
+        files=(file,),
+        lr=lr,
+        density=density,
+        seed=seed,
     )
-    config.save(tmp_path / "config.json")
-    assert TrainConfig.load(tmp_path / "config.json") == config
+    assert TrainConfig.from_toml(config.to_toml()) == config
+
+
+def test_a_file_that_a_person_writes_needs_only_what_differs_from_the_defaults(tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        """
+        epochs = 7
+        lr = 1
+        [policy]
+        taps = 2
+        extra_channels = ["cost_to_go"]
+        [execution]
+        shield = "pibt"
+        [[families]]
+        style = "maze"
+        height = [10, 30]
+        corridor_width = [1, 3]
+        [[families]]
+        share = 2
+        num_agents = [4, 40]
+        density = [0, 0.3]
+        """
+    )
+    assert TrainConfig.load(tmp_path / "mine.toml") == TrainConfig(
+        epochs=7,
+        lr=1,
+        policy=PolicyConfig(taps=2, extra_channels=("cost_to_go",)),
+        execution=Execution(sample="stuck", shield="pibt"),
+        families=(
+            Family(style="maze", height=(10, 30), corridor_width=(1, 3)),
+            Family(share=2, num_agents=(4, 40), density=(0, 0.3)),
+        ),
+    )
+    assert TrainConfig.from_toml("") == TrainConfig()
 
 
 @pytest.mark.parametrize(
     "damaged",
-    ["", "{", "[]", "null", "{}", '{"policy": {}, "surprise": 1}', '{"policy": {"surprise": 1}}', '{"policy": 1}'],
+    [
+        "{",
+        "epochs = ",
+        "epochs = 1\nepochs = 2",
+        "policy = 1",
+        "execution = []",
+        "families = 3",
+        "families = [1]",
+        "[families]\nstyle = 'maze'",
+        "epochs = '7'",
+        "epochs = 7.5",
+        "epochs = true",
+        "files = 'own.map'",
+        "[policy]\ntaps = 0",
+        "[execution]\nshield = 'none'",
+        "[[families]]\nheight = 8",
+        "[[families]]\nheight = [8]",
+        "a = " + "[" * 5000,
+        "\x00",
+    ],
 )
-def test_damaged_settings_name_their_file(tmp_path, damaged):
-    (tmp_path / "config.json").write_text(damaged)
-    with pytest.raises(ValueError, match=r"config\.json"):
-        TrainConfig.load(tmp_path / "config.json")
+def test_damaged_settings_name_their_file_in_one_line(tmp_path, damaged):
+    (tmp_path / "config.toml").write_text(damaged)
+    with pytest.raises(ValueError, match=r"config\.toml: not the settings of a training"):
+        TrainConfig.load(tmp_path / "config.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "listed"),
+    [
+        ("epoch = 1", ("'epoch'", "epochs", "families", "num_agents")),
+        ("[policy]\ntap = 1", ("'tap'", "taps", "extra_channels", "comm_radius")),
+        ("[execution]\nshields = 'pibt'", ("'shields'", "shield", "temperature")),
+        ("[[families]]\nsize = [1, 2]", ("'size'", "height", "width", "share")),
+    ],
+)
+def test_an_unknown_setting_is_named_with_all_that_there_are(text, listed):
+    with pytest.raises(ValueError, match=r"there is no setting .*the settings are ") as refusal:
+        TrainConfig.from_toml(text)
+    for word in listed:
+        assert word in str(refusal.value)
+    assert TrainConfig.from_toml(text, ignore_unknown=True) in (TrainConfig(), TrainConfig(families=(Family(),)))
+
+
+def test_rollouts_of_training_play_as_the_policy_is_executed_except_for_their_draws():
+    config = TrainConfig(execution=Execution(sample="stuck", temperature=0.5, shield="pibt", comm_range="connected"))
+    assert config.rollout_execution == replace(config.execution, sample=False)
+    for sample in (True, "stuck"):
+        assert replace(config, sample_rollouts=sample).rollout_execution == replace(config.execution, sample=sample)
+
+
+def test_settings_of_one_family_are_its_ranges_and_families_replace_them():
+    config = TrainConfig(num_agents=7, height=8, width=9, density=0.2, styles=("walls", "maze"))
+    assert config.case_families == tuple(
+        Family(style=style, height=(8, 8), width=(9, 9), num_agents=(7, 7), density=(0.2, 0.2))
+        for style in ("walls", "maze")
+    )
+    assert MIXED.case_families == MIXED.families
+
+
+@pytest.mark.parametrize("split", ["train", "validation", "test"])
+def test_the_cases_of_a_split_have_the_sizes_that_the_settings_say(split):
+    config = replace(CONFIG, train_maps=5, validation_maps=4, test_maps=3, cases_per_map=2, validation_cases_per_map=1)
+    maps, cases_per_map = {"train": (5, 2), "validation": (4, 1), "test": (3, 2)}[split]
+    cases = config.cases(split)
+    assert (len(cases.grids), len(cases)) == (maps, maps * cases_per_map)
+    expected = make_cases(split, seed=0, maps=maps, cases_per_map=cases_per_map, families=config.case_families)
+    assert cases.instances == expected.instances
+    mixed = replace(config, families=MIXED.families).cases(split)
+    assert {each.num_agents for each in mixed.instances} <= set(range(2, 6))
+    assert len(mixed) == maps * cases_per_map
+
+
+def test_the_cases_of_files_are_of_the_files_and_of_the_seed(tmp_path):
+    save_map(tmp_path / "own.map", np.zeros((6, 7), bool))
+    config = replace(CONFIG, files=(str(tmp_path),), families=MIXED.families)
+    cases = config.cases("train")
+    assert len(cases) == config.cases_per_map
+    assert {(each.grid.shape, each.num_agents) for each in cases.instances} == {((6, 7), config.num_agents)}
+    assert replace(config, data_seed=1).cases("train").instances != cases.instances
 
 
 WRONG = {
@@ -86,6 +245,7 @@ WRONG = {
     "rollout_teams": 0,
     "beta1": 2.0,
     "weight_decay": -1.0,
+    "sample_rollouts": "always",
     "validate_every": 0,
     "seed": -1,
     "data_seed": -1,

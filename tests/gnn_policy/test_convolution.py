@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import nn
 
+from gnn_policy import convolution
 from gnn_policy.convolution import StridedConvolution
 
 
@@ -49,6 +50,21 @@ def test_under_autocast_it_computes_in_bfloat16_and_its_weights_stay_float32():
     assert {maps.grad.dtype, *(each.grad.dtype for each in ours.parameters() if each.grad is not None)} == {
         torch.float32
     }
+
+
+def test_off_the_cpu_the_librarys_own_convolution_computes(monkeypatch):
+    """Shown on the meta device, which has shapes alone: no product of matrices is asked for there."""
+
+    def products(*_):
+        raise AssertionError("matrix products are for CPUs")
+
+    monkeypatch.setattr(convolution._Products, "apply", products)
+    ours = StridedConvolution(3, 4).to("meta")
+    result = ours(torch.empty(5, 3, 7, 6, device="meta"))
+    assert result.shape == (5, 4, 4, 3)
+    assert result.device.type == "meta"
+    with pytest.raises(AssertionError, match="for CPUs"):
+        StridedConvolution(3, 4)(torch.empty(5, 3, 7, 6))
 
 
 def test_weights_begin_as_those_of_the_library():

@@ -1,24 +1,24 @@
 """Aggregation: states of the mixture, labels of the expert alone."""
 
-import sys
+from collections import Counter
 from dataclasses import replace
-from functools import partial
-from itertools import permutations
-from types import ModuleType
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
+import bags
 import experts
-from gnn_policy import DecentralizedPolicy, PolicyConfig
-from gnn_policy.cases import make_cases
+from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig
+from gnn_policy.cases import Family, make_cases
 from gnn_policy.config import TrainConfig
-from gnn_policy.dagger import Aggregator, Mixture, Teacher
+from gnn_policy.dagger import Demonstrator, Mixture
 from gnn_policy.demonstrations import BatchMaker
-from gnn_policy.team_env import ACTION, CASE, FOV, GRAPH, POSITIONS, TeamEnv
-from mapf_env import Action, Instance
+from gnn_policy.teacher import Teacher
+from gnn_policy.team_env import ACTION, CASE, POSITIONS, TeamEnv
+from mapf_env import Action, Bag, Instance
 
 STEPS = [(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)]
 CONFIG = TrainConfig(
@@ -29,169 +29,225 @@ CONFIG = TrainConfig(
     dagger_every=1,
     seed=3,
 )
+FAMILIES = {
+    "alike": [Family(num_agents=(4, 4), height=(7, 7), width=(6, 6), density=(0.15, 0.15))],
+    "mixed": [
+        Family(num_agents=(2, 6), height=(5, 8), width=(5, 8)),
+        Family(style="maze", num_agents=(1, 3), height=(7, 9), width=(7, 9)),
+    ],
+}
 
 
 @pytest.fixture(scope="module")
 def cases():
-    return make_cases(
-        "train", seed=0, maps=6, cases_per_map=2, num_agents=4, height=7, width=6, density=0.15, styles=["cells"]
-    )
+    return make_cases("train", seed=0, maps=6, cases_per_map=2, families=FAMILIES["alike"])
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    return make_cases("train", seed=0, maps=6, cases_per_map=2, families=FAMILIES["mixed"])
 
 
 @pytest.fixture
-def policy():
+def policy(cases):
     torch.manual_seed(0)
-    return DecentralizedPolicy(CONFIG.policy)
+    policy = DecentralizedPolicy(CONFIG.policy)
+    bags.spread_preferences(policy, cases.instances)
+    return policy
+
+
+@pytest.fixture
+def idle_policy(policy):
+    """A policy whose robots always stay."""
+    with torch.no_grad():
+        policy.head.weight.zero_()
+        policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))
+    return policy
 
 
 def taught_by(cases, **settings):
-    return Teacher(cases, **{"w": 1.05, "node_limit": 2000, "threads": 1, **settings})
+    return Teacher(cases.grids, **{"w": 1.05, "node_limit": 2000, "threads": 1, **settings})
 
 
-def aggregating(config, policy, cases):
+def demonstrating(config, policy, cases):
     teacher = taught_by(cases, solver=config.teacher, robot_order=config.robot_order)
-    return Aggregator(config, policy, teacher, cases)
+    return Demonstrator(config, policy, teacher, cases)
 
 
 def collected(config, policy, cases, number, steps):
-    aggregator = aggregating(config, policy, cases)
+    demonstrator = demonstrating(config, policy, cases)
     try:
-        return aggregator.collect(number, steps)
+        return demonstrator.collect(number, steps)
     finally:
-        aggregator.close()
+        demonstrator.close()
 
 
 def after(positions, moves):
     return positions + np.array(STEPS)[moves]
 
 
-def assert_labels_are_the_experts(cases, states, **limits):
-    for case, positions, moves in zip(states.cases, states.positions, states.actions, strict=True):
-        result = experts.solve(cases[case].at(positions), **limits)
+def visits(demonstrations, cases):
+    """The case of each state, where its robots stand, and the moves that it is labelled with."""
+    numbers = {
+        (int(number), case.goals.tobytes()): i
+        for i, (number, case) in enumerate(zip(cases.map_of, cases.instances, strict=True))
+    }
+    assert len(numbers) == len(cases), "the goals do not tell the cases of a map apart"
+    states, found = demonstrations.states, []
+    for t in range(len(states)):
+        own = slice(states.offsets[t], states.offsets[t + 1])
+        goals = states.goals[own].astype(np.int32)
+        case = numbers[int(states.maps[t]), goals.tobytes()]
+        found.append((case, states.positions[own].astype(np.int32), demonstrations.actions[own]))
+    return found
+
+
+def assert_labels_are_the_experts(cases, found, **limits):
+    for case, positions, moves in found:
+        result = experts.solve(cases.instances[case].at(positions), **limits)
         assert result.solution
         paths = result.solution.paths
         expected = paths[1] if len(paths) > 1 else paths[0]
         assert np.array_equal(after(positions, moves), expected)
 
 
-def test_round_zero_is_the_expert_itself(cases, policy):
+@pytest.mark.parametrize("kind", FAMILIES)
+def test_round_zero_is_the_expert_itself(kind, cases, mixed, policy):
     """Visited states are closed under the expert's moves, except where a team was cut off, and lead to the goals."""
-    states, unsolved = collected(CONFIG, policy, cases, 0, 5 * 24 * 3)
+    played = {"alike": cases, "mixed": mixed}[kind]
+    demonstrations, unsolved = collected(CONFIG, policy, played, 0, 5 * 24 * 3)
     assert unsolved == 0
-    assert_labels_are_the_experts(cases, states, w=CONFIG.w, node_limit=CONFIG.expert_nodes)
-    known = {(int(c), p.tobytes()) for c, p in zip(states.cases, states.positions.astype(np.int32), strict=True)}
-    assert len(known) < len(states) == 5 * 24 * 3
-    assert set(states.cases.tolist()) == set(range(len(cases)))
-    for case in set(states.cases.tolist()):
-        assert (case, cases[case].starts.tobytes()) in known
+    found = visits(demonstrations, played)
+    assert_labels_are_the_experts(played, found, w=CONFIG.w, node_limit=CONFIG.expert_nodes)
+    known = {(case, positions.tobytes()) for case, positions, _ in found}
+    assert len(known) < len(found) == 5 * 24 * 3
+    assert {case for case, *_ in found} == set(range(len(played)))
+    for case in range(len(played)):
+        assert (case, played.instances[case].starts.tobytes()) in known
     ended = cut_off = 0
-    for case, positions, moves in zip(states.cases, states.positions.astype(np.int32), states.actions, strict=True):
-        assert not (positions == cases[case].goals).all()
+    for case, positions, moves in found:
+        goals = played.instances[case].goals
+        assert not (positions == goals).all()
         following = after(positions, moves).astype(np.int32)
-        for i in range(4):
+        for i in range(len(moves)):
             for j in range(i):
                 assert (following[i] != following[j]).any()
                 assert (following[i] != positions[j]).any() or (following[j] != positions[i]).any()
-        ended += (following == cases[case].goals).all()
-        cut_off += (int(case), following.tobytes()) not in known and not (following == cases[case].goals).all()
+        ended += (following == goals).all()
+        cut_off += (case, following.tobytes()) not in known and not (following == goals).all()
     assert ended > 0
     assert cut_off <= 5 * 3, "more teams broke off than the ends of three batches explain"
 
 
-@pytest.mark.parametrize("shield", ["idle", "pibt"])
-def test_every_team_reaches_its_goals_under_the_expert(cases, policy, shield):
-    mixture = Mixture(policy, taught_by(cases), replace(CONFIG, shield=shield))
-    env = TeamEnv(len(cases), cases, max_cycles=60, fov_radius=2, dtype="uint8", shield=shield)
+@pytest.mark.parametrize("kind", FAMILIES)
+@pytest.mark.parametrize("shield", ["idle", "pibt", "pibt_swap"])
+def test_every_team_reaches_its_goals_under_the_expert(kind, cases, mixed, policy, shield):
+    played = {"alike": cases, "mixed": mixed}[kind]
+    config = replace(CONFIG, execution=Execution(shield=shield))
+    mixture = Mixture(policy, taught_by(played), config, played)
+    settings = config.rollout_execution.env_settings(config.policy)
+    env = TeamEnv(len(played), played.instances, observation="state", max_cycles=60, dtype="uint8", **settings)
     state, reached = env.reset(seed=0), set()
     for _ in range(60):
         both, state = env.step_and_maybe_reset(mixture(state))
         done = both["next", "terminated"].squeeze(-1)
         reached |= set(both[CASE][done].tolist())
         assert not both["next", "truncated"].any()
-    assert reached == set(range(len(cases)))
+    assert reached == set(range(len(played)))
 
 
-def test_later_rounds_visit_what_the_policy_does_and_label_what_the_expert_would(cases, policy):
-    states, unsolved = collected(CONFIG, policy, cases, 1, 1)
+@pytest.mark.parametrize("kind", FAMILIES)
+def test_later_rounds_visit_what_the_policy_does_and_label_what_the_expert_would(kind, cases, mixed, policy):
+    played = {"alike": cases, "mixed": mixed}[kind]
+    demonstrations, unsolved = collected(CONFIG, policy, played, 1, 1)
     assert unsolved == 0
-    assert_labels_are_the_experts(cases, states, w=CONFIG.w, node_limit=CONFIG.expert_nodes)
-    expert_only, _ = collected(CONFIG, policy, cases, 0, 1)
-    expert_states = {(int(c), p.tobytes()) for c, p in zip(expert_only.cases, expert_only.positions, strict=True)}
-    visited = {(int(c), p.tobytes()) for c, p in zip(states.cases, states.positions, strict=True)}
-    assert visited - expert_states
+    found = visits(demonstrations, played)
+    assert_labels_are_the_experts(played, found, w=CONFIG.w, node_limit=CONFIG.expert_nodes)
+    expert_only = visits(collected(CONFIG, policy, played, 0, 1)[0], played)
+    of_expert = {(case, positions.tobytes()) for case, positions, _ in expert_only}
+    assert {(case, positions.tobytes()) for case, positions, _ in found} - of_expert
 
 
 def test_collection_plays_the_weights_of_the_moment(cases, policy):
     """The collector must not keep a copy of the policy that training goes on to change."""
-    aggregator = aggregating(CONFIG, policy, cases)
-    before, _ = aggregator.collect(1, 1)
-    again, _ = aggregator.collect(1, 1)
-    assert np.array_equal(before.positions, again.positions)
+    demonstrator = demonstrating(CONFIG, policy, cases)
+    before, _ = demonstrator.collect(1, 1)
+    again, _ = demonstrator.collect(1, 1)
+    assert np.array_equal(before.states.positions, again.states.positions)
     with torch.no_grad():
         policy.head.weight.zero_()
         policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))
-    idle, _ = aggregator.collect(1, 1)
-    aggregator.close()
-    assert {p.tobytes() for p in idle.positions} <= {each.starts.astype(np.int16).tobytes() for each in cases}
-    assert len(idle) == len(before), "where a team is stuck counts once for each step"
+    idle, _ = demonstrator.collect(1, 1)
+    demonstrator.close()
+    for case, positions, _ in visits(idle, cases):
+        assert np.array_equal(positions, cases.instances[case].starts)
+    assert len(idle) == len(before), "a state where a team is stuck counts once for each step"
 
 
-@pytest.mark.parametrize("sample", [False, True])
+def assert_equal(one, other):
+    for name in ("maps", "positions", "goals", "moves", "times", "seeds"):
+        assert np.array_equal(getattr(one.states, name), getattr(other.states, name)), name
+    assert np.array_equal(one.actions, other.actions)
+
+
+@pytest.mark.parametrize("sample", [False, True, "stuck"])
 def test_a_round_depends_on_seed_number_and_weights_alone(cases, policy, sample):
     config = replace(CONFIG, sample_rollouts=sample, beta_decay=0.6)
-    aggregator = aggregating(config, policy, cases)
-    rounds = {number: aggregator.collect(number, 100)[0] for number in (0, 1, 2)}
-    aggregator.close()
+    demonstrator = demonstrating(config, policy, cases)
+    rounds = {number: demonstrator.collect(number, 100)[0] for number in (0, 1, 2)}
+    demonstrator.close()
     for number in (2, 1):
         torch.manual_seed(number)  # the global generator plays no part
-        alone, _ = collected(config, policy, cases, number, 100)
-        for name in ("cases", "positions", "actions"):
-            assert np.array_equal(getattr(alone, name), getattr(rounds[number], name))
-    assert not np.array_equal(rounds[1].cases[:50], rounds[2].cases[:50])
+        assert_equal(collected(config, policy, cases, number, 100)[0], rounds[number])
+    assert not np.array_equal(rounds[1].states.goals[:200], rounds[2].states.goals[:200])
     other, _ = collected(replace(config, seed=4), policy, cases, 1, 100)
-    assert not np.array_equal(other.cases[:50], rounds[1].cases[:50])
+    assert not np.array_equal(other.states.goals[:200], rounds[1].states.goals[:200])
 
 
-def test_the_collected_views_are_those_that_training_rebuilds(cases):
-    """The environment shows the mixture what `BatchMaker` makes of positions, whatever the policy perceives."""
+def test_the_collected_views_are_those_that_training_rebuilds(mixed):
+    """The mixture perceives what `BatchMaker` makes of the recorded states, whatever the policy's senses are."""
     seen = []
 
     class Watching(DecentralizedPolicy):
-        def forward(self, fov, graph):
-            seen.append((fov, graph))
-            return super().forward(fov, graph)
+        def forward(self, bag):
+            seen.append(Bag(*(part.clone() for part in bag)))
+            return super().forward(bag)
 
-    perceived = replace(CONFIG.policy, cost_to_go=True, comm_range="connected", comm_weights="distance")
-    config = replace(CONFIG, policy=perceived, rollout_teams=3, rollout_length=4)
-    states, _ = collected(config, Watching(perceived), cases, 1, 12)
-    batch = BatchMaker(cases, perceived, augment=False).batch(states, np.arange(len(states)), np.random.default_rng(0))
-    shown = {(fov[b].numpy().tobytes(), graph[b].numpy().tobytes()) for fov, graph in seen for b in range(3)}
-    rebuilt = {
-        (fov.numpy().tobytes(), graph.numpy().tobytes()) for fov, graph in zip(batch[FOV], batch[GRAPH], strict=True)
-    }
-    assert len(rebuilt) > 3
-    assert rebuilt == shown
+    perceived = replace(
+        CONFIG.policy,
+        extra_channels=("cost_to_go", "previous_positions"),
+        robot_features=("last_moves", "steps_left"),
+        edge_features=("relative_position", "priority"),
+        comm_range="connected",
+        comm_weights="distance",
+    )
+    config = replace(CONFIG, policy=perceived, rollout_teams=3, rollout_length=6)
+    demonstrations, _ = collected(config, Watching(perceived), mixed, 1, 18)
+    maker = BatchMaker(mixed.grids, perceived, augment=False)
+    batch = maker.batch(demonstrations, np.arange(len(demonstrations)), np.random.default_rng(0))
+    rebuilt = fingerprints(Bag(*(batch[name] for name in Bag._fields)))
+    assert len(rebuilt) > 9
+    assert rebuilt == set().union(*map(fingerprints, seen))
 
 
-def states_at_starts(cases, teams):
-    chosen = np.arange(teams) % len(cases)
-    env = TeamEnv(teams, cases, fov_radius=2, comm_radius=3.0)
-    state = env.reset(seed=0)
-    state[CASE] = torch.from_numpy(chosen)
-    state[POSITIONS] = torch.from_numpy(np.stack([cases[i].starts for i in chosen]))
-    return state
+def fingerprints(bag):
+    """All that each team perceives; the padding of a batch sees nothing, not even a goal."""
+    parts = [part for part in bags.split(bag) if part.fov[:, 1].any()]
+    return {b"".join(each.numpy().tobytes() for each in part) for part in parts}
+
+
+def states_at_starts(cases, teams, **settings):
+    env = TeamEnv(teams, cases.instances, observation="state", fov_radius=2, comm_radius=3.0, **settings)
+    return env.reset(seed=0)
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.3, 1.0])
-def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
-    with torch.no_grad():
-        policy.head.weight.zero_()
-        policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))  # this policy always stays
-    mixture = Mixture(policy.eval(), taught_by(cases), CONFIG)
+def test_a_team_follows_the_expert_with_probability_beta(cases, idle_policy, beta):
+    mixture = Mixture(idle_policy.eval(), taught_by(cases), CONFIG, cases)
     mixture.begin(beta, seed=0)
     state = states_at_starts(cases, 2000)
     moves = mixture(state)[ACTION].numpy()
-    labels, solved = experts.relabel([cases[i] for i in state[CASE].tolist()], state[POSITIONS].numpy())
+    labels, solved = experts.relabel([cases.instances[i] for i in state[CASE].tolist()], state[POSITIONS].numpy())
     assert solved.all()
     moving = (labels != 4).any(axis=1)
     by_expert = (moves == labels).all(axis=1)
@@ -199,40 +255,34 @@ def test_a_team_follows_the_expert_with_probability_beta(cases, policy, beta):
     assert by_expert[moving].mean() == pytest.approx(beta, abs=0.04)
 
 
+def one_case(cases):
+    return replace(cases, instances=cases.instances[:1], map_of=cases.map_of[:1], family_of=cases.family_of[:1])
+
+
 def test_sampled_moves_follow_the_softmax(cases, policy):
-    policy.eval()
-    mixture = Mixture(policy, taught_by(cases), replace(CONFIG, sample_rollouts=True))
+    single, config = one_case(cases), replace(CONFIG, sample_rollouts=True, precision="float32")
+    mixture = Mixture(policy.eval(), taught_by(cases), config, single)
     mixture.begin(beta=0.0, seed=0)
-    state = states_at_starts(cases, 1).expand(4000).contiguous()
-    moves = mixture(state)[ACTION].numpy()
+    moves = mixture(states_at_starts(single, 4000))[ACTION].numpy()
     with torch.no_grad():
-        shares = torch.softmax(policy(state[FOV][:1], state[GRAPH][:1]), -1)[0].numpy()
+        shares = torch.softmax(policy(bags.at_start(single.instances, policy.config)), -1).numpy()
     counted = np.stack([(moves == action).mean(axis=0) for action in range(5)], -1)
     np.testing.assert_allclose(counted, shares, atol=0.04)
 
 
-def test_under_pibt_the_policys_values_are_its_logits(cases, policy):
-    mixture = Mixture(policy.eval(), taught_by(cases), replace(CONFIG, shield="pibt", precision="float32"))
+@pytest.mark.parametrize("shield", ["pibt", "pibt_swap"])
+@pytest.mark.parametrize("kind", FAMILIES)
+def test_under_pibt_the_policys_scores_are_its_logits(kind, shield, cases, mixed, policy):
+    played = {"alike": cases, "mixed": mixed}[kind]
+    config = replace(CONFIG, execution=Execution(shield=shield), precision="float32")
+    mixture = Mixture(policy.eval(), taught_by(played), config, played)
     mixture.begin(beta=0.0, seed=0)
-    state = states_at_starts(cases, 8)
-    values = mixture(state)[ACTION]
-    with torch.no_grad():
-        torch.testing.assert_close(values, policy(state[FOV], state[GRAPH]))
-
-
-def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
-    crowded = make_cases(
-        "train", seed=1, maps=2, cases_per_map=4, num_agents=11, height=4, width=4, density=0.0, styles=["cells"]
-    )
-    teacher = Teacher(crowded, w=1.0, node_limit=3, threads=1)
-    positions = np.stack([each.starts for each in crowded])
-    solved = [experts.solve(each, w=1.0, node_limit=3).solved for each in crowded]
-    assert not all(solved), "the cases are too easy for this test"
-    states, unsolved = teacher.label(np.arange(8), positions)
-    assert unsolved == solved.count(False)
-    assert states.cases.tolist() == [i for i in range(8) if solved[i]]
-    twice, counted = teacher.label(np.tile(np.arange(8), 2), np.tile(positions, (2, 1, 1)))
-    assert (len(twice), counted) == (2 * len(states), 2 * unsolved)
+    state = states_at_starts(played, 8, shield=shield)
+    scores = mixture(state)[ACTION]
+    for team, case in enumerate(state[CASE].tolist()):
+        with torch.no_grad():
+            logits = policy(bags.at_start([played.instances[case]], policy.config))
+        torch.testing.assert_close(scores[team, : len(logits)], logits, rtol=1e-4, atol=1e-4)
 
 
 def test_hard_case_mining_labels_teams_that_did_not_arrive_first(cases, policy):
@@ -240,22 +290,15 @@ def test_hard_case_mining_labels_teams_that_did_not_arrive_first(cases, policy):
     everything, _ = collected(config, policy, cases, 1, 3 * 8 * 12)
     mined, _ = collected(replace(config, hard_case_mining=3), policy, cases, 1, 8 * 12)
     assert (len(everything), len(mined)) == (288, 96)
-    arrived = (np.diff(everything.cases.reshape(24, 12), axis=1) != 0).any(axis=1)
+    number = np.array([case for case, *_ in visits(everything, cases)])
+    arrived = (np.diff(number.reshape(24, 12), axis=1) != 0).any(axis=1)
     assert 0 < arrived.sum() <= 16
-    paths, kept = everything.positions.reshape(24, 12, -1), mined.positions.reshape(8, 12, -1)
+    paths, kept = everything.states.positions.reshape(24, 12, -1), mined.states.positions.reshape(8, 12, -1)
     chosen = [any(np.array_equal(path, other) for other in kept) for path in paths]
     assert sum(chosen) == 8
     assert not np.array(chosen)[arrived].any()
     demonstrated, _ = collected(replace(config, hard_case_mining=3), policy, cases, 0, 8 * 12)
     assert len(demonstrated) == 96
-
-
-def test_labels_keep_the_order_of_the_visits(cases):
-    teacher = taught_by(cases)
-    order = np.array([7, 2, 7, 9, 0, 2])
-    states, _ = teacher.label(order, np.stack([cases[i].starts for i in order]))
-    assert states.cases.tolist() == order.tolist()
-    assert_labels_are_the_experts(cases, states, w=1.05, node_limit=2000)
 
 
 def plan_paths(case, **limits):
@@ -264,161 +307,92 @@ def plan_paths(case, **limits):
     return solution.paths
 
 
-def first_moves(result, num_agents):
-    assert result.solution
-    steps = np.diff(result.solution.paths[:2], axis=0)
-    return [STEPS.index(tuple(step)) for step in steps[0].tolist()] if len(steps) else [4] * num_agents
-
-
-SOLVERS = {
-    "lacam": partial(experts.lacam, node_limit=2000),
-    "prioritised": experts.prioritised,
-    "pibt": experts.pibt,
-    "experts:lacam": experts.lacam,
-}
-
-
-@pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize("threads", [1, 3])
-def test_any_solver_can_teach_the_first_move_of_its_plan(cases, name, threads):
-    teacher = taught_by(cases, solver=name, threads=threads)
-    order = np.tile(np.arange(len(cases)), 2)
-    halfway = [plan_paths(each) for each in cases]
-    positions = np.stack(
-        [each.starts for each in cases] + [paths[len(paths) // 2] for paths in halfway[:-1]] + [cases[-1].goals]
-    )
-    moves, solved = teacher.moves(order, positions)
-    assert solved.all()
-    for case, state, taught in zip(order, positions, moves, strict=True):
-        assert taught.tolist() == first_moves(SOLVERS[name](cases[case].at(state)), 4)
-    assert moves[-1].tolist() == [4] * 4
-    by_ecbs, _ = taught_by(cases).moves(order, positions)
-    assert (moves != by_ecbs).any(), "the cases do not tell this solver from ECBS"
-
-
-def test_a_solver_that_finds_nothing_teaches_nothing():
-    corridor = Instance(np.zeros((1, 4), bool), [(0, 0), (0, 3)], [(0, 3), (0, 0)])
-    for name in ("pibt", "prioritised", "lacam"):
-        teacher = taught_by([corridor], solver=name)
-        states, unsolved = teacher.label(np.zeros(3, int), np.stack([corridor.starts, corridor.goals, corridor.starts]))
-        assert (states.positions.tolist(), unsolved) == ([corridor.goals.tolist()], 2)
-        states, unsolved = teacher.demonstrate(np.zeros(2, int), np.stack([corridor.starts] * 2))
-        assert (len(states), states.positions.shape, states.actions.shape, unsolved) == (0, (0, 2, 2), (0, 2), 2)
-
-
-def test_a_solver_that_answers_another_question_is_found_out(cases, monkeypatch):
-    module = ModuleType("their_solvers")
-    module.stubborn = lambda instance: experts.solve(cases[0])  # pyright: ignore[reportAttributeAccessIssue]
-    monkeypatch.setitem(sys.modules, "their_solvers", module)
-    teacher = taught_by(cases, solver="their_solvers:stubborn")
-    assert teacher.moves(np.array([0]), cases[0].starts[None])[1].all()
-    with pytest.raises(ValueError, match=r"do not solve the instance: agent \d starts at"):
-        teacher.moves(np.array([0, 1]), np.stack([cases[0].starts, cases[1].starts]))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"solver": "cbs"}, "one of ecbs, lacam, prioritised, pibt, or one of your own as .*; got 'cbs'"),
-        ({"solver": "no.such.module:solve"}, "'no.such.module:solve' cannot be found: No module"),
-        ({"solver": "experts:oracle"}, "'experts:oracle' cannot be found: .*oracle"),
-        ({"solver": "experts:__all__"}, "'experts:__all__' is not a function or class but list"),
-    ],
-)
-def test_a_teacher_that_cannot_teach_is_refused(cases, settings, message):
-    with pytest.raises(ValueError, match=message):
-        taught_by(cases, **settings)
-
-
-def label_in_order(case, order, **limits):
-    """The label that an expert gives who is told of the robots in this order."""
-    result = experts.solve(Instance(case.grid, case.starts[order], case.goals[order]), **limits)
-    moves = first_moves(result, len(order))
-    return [moves[order.index(robot)] for robot in range(len(order))]
-
-
-@pytest.fixture(scope="module")
-def crowded():
-    return make_cases(
-        "train", seed=5, maps=4, cases_per_map=25, num_agents=4, height=4, width=4, density=0.1, styles=["cells"]
-    )
-
-
-@pytest.mark.parametrize(("robot_order", "sign"), [("index", 0), ("farthest", -1), ("nearest", 1)])
-def test_the_expert_meets_the_robots_in_the_order_asked_for(crowded, robot_order, sign):
-    which, positions = np.arange(len(crowded)), np.stack([each.starts for each in crowded])
-    teacher = taught_by(crowded, robot_order=robot_order, node_limit=500)
-    moves, solved = teacher.moves(which, positions)
-    assert solved.all()
-    orders = []
-    for case, taught, plan in zip(crowded, moves, teacher.plans(which, positions), strict=True):
-        ways = [abs(r - y) + abs(c - x) for (r, c), (y, x) in zip(case.starts, case.goals, strict=True)]
-        orders.append(sorted(range(4), key=lambda robot: (sign * ways[robot], robot)))
-        assert taught.tolist() == label_in_order(case, orders[-1], node_limit=500)
-        assert plan
-        assert not plan.violations(case)
-        assert plan.actions[0].tolist() == taught.tolist()
-    by_number, _ = taught_by(crowded, node_limit=500).moves(which, positions)
-    assert (moves != by_number).any() == (robot_order != "index"), "the cases do not tell the orders apart"
-
-
-def test_a_random_order_is_a_function_of_the_state(crowded):
-    which, positions = np.arange(len(crowded)), np.stack([each.starts for each in crowded])
-    moves, _ = taught_by(crowded, robot_order="random", node_limit=500).moves(which, positions)
-    again, _ = taught_by(crowded, robot_order="random", node_limit=500, threads=2).moves(which[::-1], positions[::-1])
-    assert np.array_equal(again[::-1], moves)
-    orders = [list(each) for each in permutations(range(4))]
-    told_apart = []
-    for case, taught in zip(crowded[:30], moves, strict=False):
-        labels = [label_in_order(case, order, node_limit=500) for order in orders]
-        assert taught.tolist() in labels
-        if labels[0] != labels[-1]:
-            told_apart.append(taught.tolist() == labels[0])
-    assert 0.1 < np.mean(told_apart) < 0.9
-
-
-def test_the_teacher_says_how_long_it_took(cases):
-    times = iter(range(0, 1000, 5))
-    teacher = taught_by(cases, solver="pibt", clock=lambda: next(times))
-    for asked in (1, 2, 3):
-        teacher.moves(np.array([0]), cases[0].starts[None])
-        assert teacher.seconds == 5 * asked
-
-
-def test_plans_from_where_teams_are_stuck(cases, policy):
+def test_plans_from_where_teams_are_stuck(cases, idle_policy):
     """Which teams those are is read from all states of the same rollouts: they never began another case."""
-    with torch.no_grad():
-        policy.head.weight.zero_()
-        policy.head.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 9.0]))  # this policy always stays
     teams, length, batches = CONFIG.rollout_teams, 10, 6
     config = replace(CONFIG, beta_decay=0.6, rollout_length=length, seed=3)
     steps = teams * length * batches
-    visited, _ = collected(config, policy, cases, 1, steps)
-    stuck, unsolved = collected(replace(config, aggregation="stuck"), policy, cases, 1, steps)
+    visited = visits(collected(config, idle_policy, cases, 1, steps)[0], cases)
+    demonstrations, unsolved = collected(replace(config, aggregation="stuck"), idle_policy, cases, 1, steps)
+    stuck = visits(demonstrations, cases)
     assert unsolved == 0
     following, failed = 0, 0
     for team in range(teams * batches):
-        own = slice(team * length, (team + 1) * length)
-        (case, *others), last = visited.cases[own], visited.positions[own][-1].astype(int)
-        if any(other != case for other in others):
+        own = visited[team * length : (team + 1) * length]
+        case, last, _ = own[-1]
+        if any(other != case for other, *_ in own):
             continue
-        plan = plan_paths(cases[case].at(last), w=config.w, node_limit=config.expert_nodes)
-        block = slice(following, following + len(plan) - 1)
-        if len(plan) == 2 and not np.array_equal(stuck.positions[block], plan[:1]):
+        plan = plan_paths(cases.instances[case].at(last), w=config.w, node_limit=config.expert_nodes)
+        block = stuck[following : following + len(plan) - 1]
+        if len(plan) == 2 and not (block and np.array_equal(block[0][1], plan[0])):
             continue  # it arrived with its last step
-        assert set(stuck.cases[block]) == {case}
-        assert np.array_equal(stuck.positions[block], plan[:-1])
-        assert np.array_equal(after(stuck.positions[block], stuck.actions[block]), plan[1:])
-        following, failed = block.stop, failed + 1
+        assert {i for i, *_ in block} == {case}
+        assert np.array_equal([positions for _, positions, _ in block], plan[:-1])
+        assert np.array_equal([after(positions, moves) for _, positions, moves in block], plan[1:])
+        following, failed = following + len(block), failed + 1
     assert following == len(stuck)
     assert 3 < failed < teams * batches - 3, "too few teams are stuck, or too few are not"
+
+
+@pytest.mark.parametrize("kind", FAMILIES)
+def test_plans_that_are_aggregated_begin_in_states_that_are_visited(kind, cases, mixed, policy):
+    """One plan for each six steps that are played, of which the first six steps are labelled."""
+    played = {"alike": cases, "mixed": mixed}[kind]
+    config, steps = replace(CONFIG, aggregation="plans", plan_steps=6, beta_decay=0.5), 5 * 24 * 2
+    everything = visits(collected(replace(config, aggregation="visited"), policy, played, 1, steps)[0], played)
+    visited = {(case, positions.tobytes()) for case, positions, _ in everything}
+    demonstrations, unsolved = collected(config, policy, played, 1, steps)
+    found, expected = visits(demonstrations, played), Counter()
+    assert unsolved == 0
+    for case, positions, _ in found[: steps // 6]:  # the states come time by time
+        assert (case, positions.tobytes()) in visited
+        labels = experts.label_plans(
+            [played.instances[case].at(positions)], steps=6, w=config.w, node_limit=config.expert_nodes
+        )
+        for first, last in pairwise(labels.offsets):
+            here = labels.positions[first:last].astype(np.int32)
+            expected[case, here.tobytes(), labels.actions[first:last].tobytes()] += 1
+    assert expected == Counter((case, here.tobytes(), moves.tobytes()) for case, here, moves in found)
+
+
+@pytest.mark.parametrize("kind", FAMILIES)
+def test_where_plans_are_aggregated_round_zero_has_whole_plans_from_starts(kind, cases, mixed, policy):
+    played = {"alike": cases, "mixed": mixed}[kind]
+    config, steps = replace(CONFIG, aggregation="plans", plan_steps=6), 5 * 24 * 2
+    demonstrations, unsolved = collected(config, policy, played, 0, steps)
+    assert unsolved == 0
+    found, first, begun = visits(demonstrations, played), 0, set()
+    while first < len(found):
+        case, positions, _ = found[first]
+        assert np.array_equal(positions, played.instances[case].starts)
+        plan = plan_paths(played.instances[case], w=config.w, node_limit=config.expert_nodes)
+        block = found[first : first + len(plan) - 1]
+        assert all(i == case for i, *_ in block)
+        assert np.array_equal([here for _, here, _ in block], plan[:-1])
+        assert np.array_equal([after(here, moves) for _, here, moves in block], plan[1:])
+        assert demonstrations.states.times[first : first + len(block)].tolist() == list(range(len(block)))
+        first += len(block)
+        begun.add(case)
+    assert (demonstrations.states.times == 0).sum() == steps // 6
+    assert len(begun) > len(played) / 2
+    again, _ = collected(config, policy, played, 0, steps)
+    assert_equal(demonstrations, again)
+
+
+def test_where_no_team_is_stuck_nothing_is_demonstrated(policy):
+    near = Instance(np.zeros((2, 3), bool), [[0, 0], [1, 0]], [[0, 1], [1, 0]])
+    single = make_cases("train", seed=0, maps=1, cases_per_map=1, families=FAMILIES["alike"])
+    single = replace(single, instances=[near], grids=[near.grid])
+    config = replace(CONFIG, aggregation="stuck", beta_decay=1.0, rollout_length=5)
+    found, unsolved = collected(config, policy, single, 1, 1)
+    assert (len(found), unsolved) == (0, 0)
 
 
 def test_round_zero_imitates_whatever_is_aggregated_later(cases, policy):
     visited, stuck = (
         collected(replace(CONFIG, aggregation=each), policy, cases, 0, 100)[0] for each in ("visited", "stuck")
     )
-    assert np.array_equal(visited.positions, stuck.positions)
+    assert_equal(visited, stuck)
 
 
 def test_weights_seed_and_beta_of_a_round_reach_the_collectors_processes(cases, policy):
@@ -430,46 +404,47 @@ def test_weights_seed_and_beta_of_a_round_reach_the_collectors_processes(cases, 
 
     rounds = []
     for _ in range(2):
-        aggregator = aggregating(settings, policy, cases)
+        demonstrator = demonstrating(settings, policy, cases)
         try:
             biased(Action.IDLE)
-            by_expert = aggregator.collect(0, 4 * 24)[0]
-            waiting = aggregator.collect(1, 4 * 24)[0]
+            by_expert = demonstrator.collect(0, 4 * 24)[0]
+            waiting = demonstrator.collect(1, 4 * 24)[0]
             biased(Action.UP)
-            rounds.append([by_expert, waiting, aggregator.collect(2, 4 * 24)[0]])
+            rounds.append([by_expert, waiting, demonstrator.collect(2, 4 * 24)[0]])
         finally:
-            aggregator.close()
-    by_expert, waiting, climbing = rounds[0]
-    assert (np.diff(by_expert.positions.astype(int), axis=0) != 0).any()
-    starts = np.stack([case.starts for case in cases])
-    assert np.array_equal(waiting.positions, starts[waiting.cases])
-    rows = climbing.positions[..., 0].sum(axis=1)
-    assert (rows < starts[climbing.cases, :, 0].sum(axis=1)).any()
+            demonstrator.close()
+    by_expert, waiting, climbing = (visits(each, cases) for each in rounds[0])
+    assert any((later[1] != now[1]).any() for now, later in pairwise(by_expert))
+    for case, positions, _ in waiting:
+        assert np.array_equal(positions, cases.instances[case].starts)
+    heights = [(positions[:, 0].sum(), cases.instances[case].starts[:, 0].sum()) for case, positions, _ in climbing]
+    assert any(now < then for now, then in heights)
     for once, again in zip(*rounds, strict=True):
-        assert np.array_equal(once.positions, again.positions)
+        assert_equal(once, again)
 
 
-def test_collectors_side_by_side_play_other_episodes(cases, policy):
+def test_collectors_side_by_side_play_other_episodes(mixed, policy):
     settings = replace(CONFIG, rollout_teams=4, backend="process", collectors=2)
-    aggregator = aggregating(settings, policy, cases)
+    demonstrator = demonstrating(settings, policy, mixed)
     try:
-        states, _ = aggregator.collect(1, 4 * 24)
+        demonstrations, _ = demonstrator.collect(1, 4 * 24)
     finally:
-        aggregator.close()
-    assert len(states) == 4 * 24
-    one, other = states.positions.reshape(2, -1)
-    assert not np.array_equal(one, other)
+        demonstrator.close()
+    found = visits(demonstrations, mixed)
+    assert len(found) == 4 * 24
+    one, other = ([(case, positions.tobytes()) for case, positions, _ in half] for half in (found[:48], found[48:]))
+    assert one != other
 
 
 def test_teams_are_shared_evenly_by_collectors(cases, policy):
     with pytest.raises(ValueError, match="multiple of its 2 collectors, got 5"):
-        aggregating(replace(CONFIG, backend="process", collectors=2), policy, cases)
+        demonstrating(replace(CONFIG, backend="process", collectors=2), policy, cases)
     with pytest.raises(ValueError, match='backend "process"'):
         replace(CONFIG, collectors=2)
 
 
 def test_the_mixture_reads_what_the_environment_writes(policy, cases):
-    mixture = Mixture(policy, taught_by(cases), CONFIG)
-    state = TeamEnv(2, cases).reset()
+    mixture = Mixture(policy, taught_by(cases), CONFIG, cases)
+    state = TeamEnv(2, cases.instances, observation="state").reset()
     assert isinstance(state, TensorDict)
     assert set(mixture.in_keys) <= set(state.keys(include_nested=True))

@@ -1,22 +1,36 @@
 """Demonstrations: what training sees is what play sees, and files are whole or say so."""
 
-import math
 import os
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import safetensors.numpy
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from gnn_policy.cases import make_cases
-from gnn_policy.demonstrations import EXPERT_ACTION, BatchMaker, Demonstrations
+from gnn_policy.cases import Family, make_cases
+from gnn_policy.demonstrations import LEAST, BatchMaker, Demonstrations
+from gnn_policy.imitation import EXPERT_ACTION
 from gnn_policy.network import DecentralizedPolicy, PolicyConfig
-from gnn_policy.team_env import FOV, GRAPH
-from mapf_env import parallel_env
+from mapf_env import HISTORY, Bag, Instance, States, parallel_env
 
-SHAPES = [(7, 7), (5, 9)]
+SIZES = {
+    "square": [Family(height=(7, 7), width=(7, 7), num_agents=(3, 3), density=(0.15, 0.15))],
+    "mixed": [
+        Family(height=(4, 9), width=(4, 9), num_agents=(1, 6), density=(0.0, 0.2)),
+        Family(style="warehouse", height=(9, 9), width=(12, 16), num_agents=(2, 8)),
+    ],
+}
 PERCEIVED = PolicyConfig(encoder="lean", fov_radius=2, comm_radius=3.0)
+RICH = replace(
+    PERCEIVED,
+    extra_channels=("cost_to_go", "other_goals"),
+    robot_features=("on_goal", "steps_to_go"),
+    edge_features=("relative_position", "goal_direction", "greedy_moves"),
+    comm_weights="distance",
+)
 STEPS = [(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)]
 
 
@@ -25,132 +39,220 @@ def turned_by_numpy(array, g):
     return np.rot90(np.flip(array, -1) if g >= 4 else array, g % 4, axes=(-2, -1))
 
 
-def random_states(shape, count=40, seed=0):
-    """Cases on three maps, and random states and moves of them."""
+def turned_action(action, g):
+    step = np.zeros((3, 3))
+    step[1 + STEPS[action][0], 1 + STEPS[action][1]] = 1
+    row, col = np.argwhere(turned_by_numpy(step, g))[0] - 1
+    return STEPS.index((row, col))
+
+
+def random_states(sizes="square", count=40, seed=0, comm_radius=3.0):
+    """Maps, and random states and moves of teams on them, with goals and histories of their own."""
     generator = np.random.default_rng(seed)
-    cases = make_cases(
-        "train",
-        seed=seed,
-        maps=3,
-        cases_per_map=2,
-        num_agents=3,
-        height=shape[0],
-        width=shape[1],
-        density=0.15,
-        styles=["cells"],
-    )
+    cases = make_cases("train", seed=seed, maps=6, cases_per_map=2, families=SIZES[sizes])
     chosen = generator.integers(len(cases), size=count)
-    positions = np.stack([generator.permutation(np.argwhere(~cases[i].grid))[:3] for i in chosen])
-    moves = generator.integers(5, size=(count, 3))
-    return cases, Demonstrations(chosen.astype(np.int32), positions.astype(np.int16), moves.astype(np.int8))
-
-
-def connects(positions, radius):
-    """Whether all robots reach each other over robots closer than `radius`."""
-    reached, rest = [positions[0]], list(positions[1:])
-    for here in reached:
-        near = [there for there in rest if math.dist(here, there) < radius]
-        rest = [there for there in rest if math.dist(here, there) >= radius]
-        reached += near
-    return not rest
-
-
-def seen_in_play(case, positions, config):
-    """What the PettingZoo environment shows in a state: (N, C, F, F) and (N, N)."""
-    height, width = case.grid.shape
-    radius = config.comm_radius
-    while config.comm_range == "connected" and not connects(case.starts.tolist(), radius):
-        radius *= 1.1
-    env = parallel_env(
-        num_agents=3,
-        height=height,
-        width=width,
-        fov_radius=config.fov_radius,
-        extra_channels=("cost_to_go",) if config.cost_to_go else (),
-        comm_radius=radius,
-        comm_weights=config.comm_weights,
+    teams = [cases.instances[i].num_agents for i in chosen]
+    free = [np.argwhere(~cases.instances[i].grid) for i in chosen]
+    positions, goals = (
+        np.concatenate([generator.permutation(cells)[:n] for cells, n in zip(free, teams, strict=True)])
+        for _ in range(2)
     )
-    seen, _ = env.reset(seed=0, options={"instance": case.at(positions)})
-    return np.stack([each["fov"] for each in seen.values()]), np.stack([each["graph"] for each in seen.values()])
+    robots = sum(teams)
+    ages = generator.integers(0, HISTORY + 1, (robots, 1))
+    moves = np.where(np.arange(HISTORY) < ages, generator.integers(5, size=(robots, HISTORY)), -1)
+    states = States(
+        maps=cases.map_of[chosen],
+        offsets=np.cumsum([0, *teams]),
+        positions=positions.astype(np.int16),
+        goals=goals.astype(np.int16),
+        moves=moves.astype(np.int8),
+        under_way=generator.integers(0, 30, robots).astype(np.int32),
+        seeds=generator.integers(2**63, size=count, dtype=np.uint64),
+        times=generator.integers(0, 20, count).astype(np.int32),
+        limits=np.full(count, 30, np.int32),
+        comm_radius=np.full(count, comm_radius) + generator.integers(0, 2, count),  # pyright: ignore[reportArgumentType]
+    )
+    return cases.grids, Demonstrations(states, generator.integers(5, size=robots).astype(np.int8))
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        PERCEIVED,
-        replace(PERCEIVED, comm_range="connected"),
-        replace(PERCEIVED, comm_weights="distance"),
-        replace(PERCEIVED, cost_to_go=True, comm_range="connected", comm_weights="distance"),
-    ],
-)
-@pytest.mark.parametrize("shape", SHAPES)
-def test_without_augmentation_a_batch_is_what_play_shows(shape, config):
-    cases, states = random_states(shape)
-    batches = BatchMaker(cases, config, augment=False)
+def rows_of(states, t):
+    return slice(states.offsets[t], states.offsets[t + 1])
+
+
+def seen_in_play(grids, states, t, config):
+    """What the PettingZoo environment shows to the robots of state t, by name."""
+    rows, grid = rows_of(states, t), grids[states.maps[t]]
+    case = Instance(grid, states.positions[rows].astype(np.int32), states.goals[rows].astype(np.int32))
+    senses = {**config.senses(), "comm_radius": float(states.comm_radius[t])}
+    env = parallel_env(num_agents=case.num_agents, height=grid.shape[0], width=grid.shape[1], density=0.0, **senses)
+    seen, _ = env.reset(seed=0, options={"instance": case})
+    return {name: np.stack([each[name] for each in seen.values()]) for name in next(iter(seen.values()))}
+
+
+def graph_of(batch, row, attr=False):
+    """The dense graph (N, N), or features of edges (N, N, D), of one team of a batch."""
+    team, (sender, receiver) = batch["team"].numpy(), batch["edge_index"].numpy()
+    first, size = np.flatnonzero(team == row)[0], (team == row).sum()
+    own = team[receiver] == row
+    assert (team[sender[own]] == row).all()
+    values = batch["edge_attr" if attr else "edge_weight"].numpy()[own]
+    dense = np.zeros((size, size, *values.shape[1:]), np.float32)
+    dense[receiver[own] - first, sender[own] - first] = values
+    return dense
+
+
+@pytest.mark.parametrize("config", [PERCEIVED, replace(PERCEIVED, comm_weights="distance"), RICH])
+@pytest.mark.parametrize("sizes", SIZES)
+def test_without_augmentation_a_batch_is_what_play_shows(sizes, config):
+    grids, demonstrations = random_states(sizes)
+    states = demonstrations.states
+    batches = BatchMaker(grids, config, augment=False)
     chosen = np.array([5, 0, 39, 5, 17])
-    batch = batches.batch(states, chosen, np.random.default_rng(0))
-    assert batch.batch_size == (5,)
+    batch = batches.batch(demonstrations, chosen, np.random.default_rng(0))
+    assert set(batch.keys()) == {*Bag._fields, EXPERT_ACTION}
+    assert batch["fov"].dtype == torch.uint8
     read = []
     policy = DecentralizedPolicy(config)
     policy.encoder.register_forward_pre_hook(lambda module, inputs: read.append(inputs[0].clone()))
-    policy(batch[FOV], batch[GRAPH])
+    policy(Bag(*(batch[name] for name in Bag._fields)))
     for row, index in enumerate(chosen):
-        views, graph = seen_in_play(cases[states.cases[index]], states.positions[index], config)
-        assert batch[FOV].dtype == torch.uint8
-        np.testing.assert_allclose(read[0].unflatten(0, (5, 3))[row], views, atol=1e-6)
-        assert np.array_equal(np.asarray(batch[GRAPH])[row], graph)
-        assert np.array_equal(np.asarray(batch[EXPERT_ACTION])[row], states.actions[index])
+        seen, own = seen_in_play(grids, states, index, config), batch["team"] == row
+        np.testing.assert_allclose(read[0][own], seen["fov"], atol=1e-6)
+        assert np.array_equal(graph_of(batch, row), seen["graph"])
+        assert np.array_equal(batch[EXPERT_ACTION][own], demonstrations.actions[rows_of(states, index)])
+        if config is RICH:
+            assert np.array_equal(batch["scalars"][own], seen["scalars"])
+            assert np.array_equal(graph_of(batch, row, attr=True), seen["edge_attr"])
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_augmentation_turns_views_and_labels_together_and_uses_every_symmetry(shape):
-    cases, states = random_states(shape)
-    batches = BatchMaker(cases, PERCEIVED, augment=True)
-    index = 11
-    batch = batches.batch(states, np.full(200, index), np.random.default_rng(0))
-    views, graph = seen_in_play(cases[states.cases[index]], states.positions[index], PERCEIVED)
+@pytest.mark.parametrize("sizes", SIZES)
+def test_augmentation_turns_views_and_labels_together_and_uses_every_symmetry(sizes):
+    grids, demonstrations = random_states(sizes)
+    states, index = demonstrations.states, 11
+    batches = BatchMaker(grids, PERCEIVED, augment=True)
+    batch = batches.batch(demonstrations, np.full(200, index), np.random.default_rng(0))
+    seen = seen_in_play(grids, states, index, PERCEIVED)
+    labels = demonstrations.actions[rows_of(states, index)].tolist()
     used = set()
     for row in range(200):
-        matching = [g for g in range(8) if np.array_equal(np.asarray(batch[FOV])[row], turned_by_numpy(views, g))]
+        own = batch["team"] == row
+        matching = [g for g in range(8) if np.array_equal(batch["fov"][own], turned_by_numpy(seen["fov"], g))]
         assert len(matching) == 1
-        labels = np.asarray(batch[EXPERT_ACTION])[row].tolist()
-        for robot, label in enumerate(labels):
-            step = np.zeros((3, 3))
-            down, right = STEPS[states.actions[index, robot]]
-            step[1 + down, 1 + right] = 1
-            down, right = STEPS[label]
-            assert turned_by_numpy(step, matching[0])[1 + down, 1 + right] == 1
-        assert np.array_equal(np.asarray(batch[GRAPH])[row], graph)
+        assert batch[EXPERT_ACTION][own].tolist() == [turned_action(label, matching[0]) for label in labels]
+        assert np.array_equal(graph_of(batch, row), seen["graph"])
         used.add(matching[0])
-    assert used == (set(range(8)) if shape[0] == shape[1] else {0, 2, 4, 6})
+    assert used == set(range(8))
+
+
+def test_history_and_directions_of_neighbours_turn_with_the_labels():
+    config = replace(PERCEIVED, robot_features=("last_moves",), edge_features=("relative_position",), memory=HISTORY)
+    grids, demonstrations = random_states("mixed")
+    states = demonstrations.states
+    batch = BatchMaker(grids, config, augment=True).batch(demonstrations, np.arange(40), np.random.default_rng(1))
+    plain = BatchMaker(grids, config, augment=False).batch(demonstrations, np.arange(40), np.random.default_rng(1))
+    for row in range(40):
+        own, rows = (batch["team"] == row).numpy(), rows_of(states, row)
+        views = plain["fov"][own].numpy()  # pyright: ignore[reportArgumentType]
+        labels, moves = demonstrations.actions[rows], states.moves[rows]
+        past = batch["scalars"][own].reshape(-1, HISTORY, 5).numpy()  # pyright: ignore[reportArgumentType]
+        known = [[int(each.argmax()) if each.any() else -1 for each in robot] for robot in past]  # pyright: ignore[reportAttributeAccessIssue]
+        fitting = []
+        for g in range(8):
+            if not np.array_equal(batch["fov"][own], turned_by_numpy(views, g)):  # pyright: ignore[reportArgumentType]
+                continue
+            becomes = [*(turned_action(action, g) for action in range(5)), -1]
+            down, right = STEPS[becomes[2]], STEPS[becomes[3]]
+            attr = graph_of(plain, row, attr=True) @ np.array([down, right])
+            fitting.append(
+                [becomes[label] for label in labels] == batch[EXPERT_ACTION][own].tolist()  # pyright: ignore[reportArgumentType]
+                and [[becomes[move] for move in robot] for robot in moves.tolist()] == known
+                and np.allclose(attr, graph_of(batch, row, attr=True), atol=1e-6)
+            )
+        assert any(fitting)
 
 
 def test_equal_generators_give_equal_batches():
-    cases, states = random_states((7, 7))
-    batches = BatchMaker(cases, PERCEIVED, augment=True)
-    one, two = (batches.batch(states, np.arange(20), np.random.default_rng(5)) for _ in range(2))
-    assert (one == two).all()
+    grids, demonstrations = random_states("mixed")
+    batches = BatchMaker(grids, RICH, augment=True)
+    one, two, three = (batches.batch(demonstrations, np.arange(20), np.random.default_rng(s)) for s in (5, 5, 6))
+    assert all(torch.equal(one[name], two[name]) for name in one.keys())  # noqa: SIM118 (a TensorDict)
+    assert not torch.equal(one["fov"], three["fov"])
+    threaded = BatchMaker(grids, RICH, augment=True, threads=3)
+    again = threaded.batch(demonstrations, np.arange(20), np.random.default_rng(5))
+    assert all(torch.equal(one[name], again[name]) for name in one.keys())  # noqa: SIM118
 
 
-def test_files_round_trip_and_concatenation_keeps_the_order(tmp_path):
-    parts = [random_states((7, 7), count, seed=count)[1] for count in (3, 1, 20)]
+@pytest.mark.parametrize("parts", [1, 2, 3])
+def test_batches_made_ahead_are_those_made_in_turn(parts):
+    grids, demonstrations = random_states("mixed")
+    batches = BatchMaker(grids, RICH, augment=True)
+    draws = [np.arange(size) for size in (7, 1, LEAST - 1, LEAST, 20)]
+    ahead = list(batches.prefetched(demonstrations, draws, np.random.default_rng(3), parts))
+    generator = np.random.default_rng(3)
+    assert [len(each) for each in ahead] == [parts, 1, 1, parts, parts]
+    for chosen, pieces in zip(draws, ahead, strict=True):
+        for piece, own in zip(pieces, np.array_split(chosen, len(pieces)), strict=True):
+            expected = batches.batch(demonstrations, own, generator)
+            assert all(torch.equal(piece[name], expected[name]) for name in expected.keys())  # noqa: SIM118
+    assert list(batches.prefetched(demonstrations, [], generator)) == []
+
+
+def test_an_error_while_batches_are_made_ahead_is_raised():
+    grids, demonstrations = random_states()
+    batches = BatchMaker(grids, PERCEIVED, augment=False)
+    made = batches.prefetched(demonstrations, [np.arange(3), np.array([99])], np.random.default_rng(0))
+    assert len(next(made)) == 1
+    with pytest.raises(IndexError):
+        next(made)
+
+
+def assert_equal(one, other):
+    assert np.array_equal(one.actions, other.actions)
+    assert one.actions.dtype == other.actions.dtype
+    for each in fields(States):
+        first, second = getattr(one.states, each.name), getattr(other.states, each.name)
+        assert np.array_equal(first, second), each.name
+        assert first.dtype == second.dtype, each.name
+
+
+@settings(max_examples=20)
+@given(counts=st.lists(st.integers(1, 8), min_size=1, max_size=4), sizes=st.sampled_from(list(SIZES)))
+def test_files_round_trip_and_concatenation_keeps_the_order(tmp_path_factory, counts, sizes):
+    parts = [random_states(sizes, count, seed=count)[1] for count in counts]
     whole = Demonstrations.concatenate(parts)
-    whole.save(tmp_path / "states.safetensors")
-    again = Demonstrations.load(tmp_path / "states.safetensors")
-    assert len(again) == 24
-    for name in ("cases", "positions", "actions"):
-        stored = getattr(again, name)
-        assert stored.dtype == getattr(whole, name).dtype
-        assert np.array_equal(stored, np.concatenate([getattr(part, name) for part in parts]))
-    assert os.listdir(tmp_path) == ["states.safetensors"]
+    assert len(whole) == sum(counts)
+    folder = tmp_path_factory.mktemp("states")
+    whole.save(folder / "states.safetensors")
+    again = Demonstrations.load(folder / "states.safetensors")
+    assert_equal(again, whole)
+    assert os.listdir(folder) == ["states.safetensors"]
+    first = 0
+    for part in parts:
+        assert_equal(again.take(np.arange(first, first + len(part))), part)
+        first += len(part)
+
+
+def test_states_are_taken_in_the_order_asked_for():
+    _, demonstrations = random_states("mixed")
+    states, chosen = demonstrations.states, np.array([7, 2, 7, 30])
+    taken = demonstrations.take(chosen)
+    assert np.array_equal(taken.states.maps, states.maps[chosen])
+    rows = [rows_of(states, t) for t in chosen]
+    assert np.array_equal(taken.states.positions, np.concatenate([states.positions[each] for each in rows]))
+    assert np.array_equal(taken.actions, np.concatenate([demonstrations.actions[each] for each in rows]))
+    none = demonstrations.take(np.empty(0, np.intp))
+    assert (len(none), len(none.actions)) == (0, 0)
+    assert_equal(Demonstrations.concatenate([none, taken]), taken)
 
 
 def test_damaged_files_say_so(tmp_path):
     file = tmp_path / "states.safetensors"
-    random_states((7, 7))[1].save(file)
+    _, demonstrations = random_states()
+    demonstrations.save(file)
     content = file.read_bytes()
     foreign = safetensors.numpy.save({"weights": np.zeros(3)})
-    for damaged in (b"", content[:5], content[:100], content[:-1], b"\xff" * len(content), foreign):
+    some = safetensors.numpy.save({"actions": demonstrations.actions, "positions": demonstrations.states.positions})
+    for damaged in (b"", content[:5], content[:100], content[:-1], b"\xff" * len(content), foreign, some):
         file.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"states\.safetensors is damaged"):
             Demonstrations.load(file)
@@ -158,7 +260,7 @@ def test_damaged_files_say_so(tmp_path):
 
 def test_a_crash_in_the_middle_of_writing_leaves_the_old_file(tmp_path, monkeypatch):
     file = tmp_path / "states.safetensors"
-    old, new = random_states((7, 7), 3)[1], random_states((7, 7), 5)[1]
+    old, new = random_states(count=3)[1], random_states(count=5)[1]
     old.save(file)
 
     def power_cut(*_):

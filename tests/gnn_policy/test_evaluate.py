@@ -1,6 +1,8 @@
 """The command that evaluates: any policy, any cases, as it was trained where nothing else is asked for."""
 
 import json
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from dataclasses import fields, replace
 
@@ -10,6 +12,8 @@ import torch
 from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, evaluation, examination, save
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
+from mapf_env import random_instance, save_instances
+from small_training import MIXED
 
 CONFIG = TrainConfig(
     policy=PolicyConfig(encoder="lean", features=8, fov_radius=2),
@@ -32,7 +36,7 @@ CHANGES = """
 @pytest.fixture
 def file(tmp_path):
     torch.manual_seed(0)
-    save(DecentralizedPolicy(CONFIG.policy), tmp_path / "policy.safetensors", training=CONFIG.to_json())
+    save(DecentralizedPolicy(CONFIG.policy), tmp_path / "policy.safetensors", training=CONFIG.to_toml())
     return tmp_path / "policy.safetensors"
 
 
@@ -65,7 +69,7 @@ def test_what_is_not_given_is_as_in_training(file, monkeypatch):
     assert folder == file.parent / "evaluation"
 
 
-def test_rows_of_a_policy_of_the_package_play_under_the_shield_of_its_training(monkeypatch, tmp_path):
+def test_rows_play_under_the_shield_that_the_policys_file_says(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     _, folder, how = examined(monkeypatch, "n12-informed", "--rows", "argmax", "stuck,idle")
     assert how["variants"] == [Execution(shield="pibt"), Execution(sample="stuck")]
@@ -90,6 +94,8 @@ def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path, split
         "num_agents": (2, 5),
         "variants": [Execution(sample="stuck", temperature=0.5), Execution(shield="pibt", comm_range="connected")],
         "split": split,
+        "task": "one_shot",
+        "steps": 256,
         "threads": 1,
         "failures": 2,
     }
@@ -102,7 +108,7 @@ def test_it_writes_numbers_and_an_animation(file, capsys):
     folder = file.parent / "evaluation"
     page = (folder / "failures.html").read_text(encoding="utf-8")
     assert [page.count(f'"title":"{n} robots, case ') for n in (2, 3)] == [2, 2]
-    tables = json.loads((folder / "results.json").read_text())["num_agents"]
+    tables = json.loads((folder / "results.json").read_text())["tables"]
     assert list(tables) == ["2", "3"]
     assert all(table["cases"] == 6 for table in tables.values())
     assert ET.parse(folder / "animation.svg").getroot().tag.endswith("svg")
@@ -111,12 +117,107 @@ def test_it_writes_numbers_and_an_animation(file, capsys):
     assert str(folder) in shown.replace("\n", "")
 
 
+def test_the_rows_of_a_policy_are_its_own_execution_drawn_in_three_ways(file, monkeypatch):
+    execution = Execution(sample=True, temperature=0.5, shield="pibt", comm_weights="distance")
+    save(DecentralizedPolicy(CONFIG.policy, execution), file, training=CONFIG.to_toml())
+    _, _, how = examined(monkeypatch, str(file))
+    assert how["variants"] == [replace(execution, sample=sample) for sample in (False, "stuck", True)]
+    _, _, how = examined(monkeypatch, str(file), "--rows", "stuck")
+    assert how["variants"] == [Execution(sample="stuck", shield="pibt")]
+
+
+def test_families_of_training_have_a_table_each_unless_a_map_is_asked_for(file, monkeypatch, capsys):
+    save(DecentralizedPolicy(CONFIG.policy), file, training=replace(CONFIG, families=MIXED.families).to_toml())
+    evaluate.main([str(file), "--threads", "1", "--rows", "argmax"])
+    folder = file.parent / "evaluation"
+    results = json.loads((folder / "results.json").read_text())
+    assert list(results["tables"]) == ["2 to 5 robots, family 1 (cells)", "3 to 4 robots, family 2 (maze)"]
+    shown = capsys.readouterr().out
+    assert all(f"{title}, 3 test maps" in shown for title in results["tables"])
+    evaluate.main([str(file), "--rows", "argmax", "--num-agents", "2", "4", "--out", str(file.parent / "sizes")])
+    sized = json.loads((file.parent / "sizes" / "results.json").read_text())
+    assert list(sized["tables"]) == [
+        f"{N} robots, family {family}" for family in ("1 (cells)", "2 (maze)") for N in (2, 4)
+    ]
+    config, _, _ = examined(monkeypatch, str(file), "--height", "9", "--out", str(file.parent / "high"))
+    assert config == replace(CONFIG, height=9)
+
+
+def test_evaluations_of_other_families_are_not_mixed_up(file, capsys):
+    for number, families in enumerate((MIXED.families, (replace(MIXED.families[0], density=(0.3, 0.3)),))):
+        save(DecentralizedPolicy(CONFIG.policy), file, training=replace(CONFIG, families=families).to_toml())
+        if not number:
+            evaluate.main([str(file), "--threads", "1", "--rows", "argmax"])
+    with pytest.raises(SystemExit):
+        evaluate.main([str(file), "--threads", "1", "--rows", "argmax"])
+    assert "other settings (" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("split", ["test", "validation"])
+def test_the_users_files_are_examined(file, tmp_path, capsys, split):
+    grid = random_instance(height=6, width=7, density=0.1, seed=0).grid
+    instances = [random_instance(grid=grid, num_agents=2 + seed % 3, seed=seed) for seed in range(20)]
+    save_instances(tmp_path / "set.json", instances)
+    out = tmp_path / "out"
+    evaluate.main([str(file), "--files", str(tmp_path / "set.json"), "--split", split, "--out", str(out)])
+    results = json.loads((out / "results.json").read_text())
+    assert list(results["tables"]) == ["your maps"]
+    assert results["tables"]["your maps"]["cases"] == 2
+    assert results["settings"]["files"] == [str(tmp_path / "set.json")]
+    assert "your maps" in capsys.readouterr().out
+
+
+def test_lifelong_teams_have_a_table_of_throughput(file, capsys):
+    arguments = [str(file), "--task", "lifelong", "--steps", "20", "--num-agents", "2", "3", "--threads", "1"]
+    evaluate.main(arguments)
+    numbers = file.parent / "evaluation" / "results.json"
+    before = numbers.read_bytes()
+    results = json.loads(before)
+    assert (results["settings"]["task"], results["settings"]["steps"]) == ("lifelong", 20)
+    assert list(results["tables"]) == ["2", "3"]
+    for table in results["tables"].values():
+        assert [row["name"] for row in table["rows"]] == [
+            "argmax",
+            "stuck,1",
+            "sampled,1",
+            *evaluation.LIFELONG_BASELINES,
+        ]
+        rates = {row["name"]: row["throughput"]["mean"] for row in table["rows"]}
+        assert rates["PIBT*"] > rates["random"] >= 0
+        assert (table["cases"], table["steps"]) == (6, 20)
+    shown = capsys.readouterr().out
+    assert "arrivals" in shown
+    assert "3 robots, 3 test maps" in shown
+    assert ET.parse(numbers.parent / "animation.svg").getroot().tag.endswith("svg")
+    evaluate.main(arguments)
+    assert numbers.read_bytes() == before
+    capsys.readouterr()
+    for other in (["--steps", "21"], ["--task", "one_shot"]):
+        with pytest.raises(SystemExit):
+            evaluate.main([*arguments, *other])
+        assert "other settings (" in capsys.readouterr().err
+
+
+def test_evaluation_loads_neither_the_training_loop_nor_torchrl(file):
+    program = (
+        "import sys\n"
+        "from gnn_policy import evaluate\n"
+        f"evaluate.main([{str(file)!r}, '--threads', '1', '--maps', '1', '--cases-per-map', '1'])\n"
+        "training = {'training', 'dagger', 'teacher', 'demonstrations', 'imitation', 'team_env', 'half_batches'}\n"
+        "heavy = {'torchrl', 'tensorboard', *(f'gnn_policy.{name}' for name in training)}\n"
+        "print(sorted(heavy & sys.modules.keys()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 @pytest.mark.parametrize(
     ("changed", "named"),
     [
         ("--styles walls", "styles"),
         ("--rows argmax", "variants"),
-        ("--num-agents 2", "num_agents"),
+        ("--num-agents 2", "tables"),
         ("--split validation --maps 3 --cases-per-map 2", "split"),
         ("--maps 2 --seed 9", "maps, seed"),
     ],
@@ -146,7 +247,7 @@ def test_results_of_another_policy_or_another_program_are_not_overwritten(file, 
     evaluate.main([str(file), "--threads", "1"])
     numbers = file.parent / "evaluation" / "results.json"
     torch.manual_seed(1)
-    save(DecentralizedPolicy(CONFIG.policy), file, training=CONFIG.to_json())
+    save(DecentralizedPolicy(CONFIG.policy), file, training=CONFIG.to_toml())
     for content, named in ((numbers.read_text(), "policy"), ("[]", "unknown"), ("{", "unknown"), ("{}", "unknown")):
         numbers.write_text(content)
         with pytest.raises(SystemExit):
@@ -172,6 +273,9 @@ def test_results_of_another_policy_or_another_program_are_not_overwritten(file, 
         "--threads -1",
         "--device abacus",
         "--failures -1",
+        "--failures 1 --task lifelong",
+        "--task lifelong --steps 0",
+        "--files nowhere.map",
     ],
 )
 def test_a_mistake_takes_one_line(file, capsys, wrong):
@@ -205,7 +309,7 @@ def test_each_team_size_is_written_when_it_is_finished_and_not_played_again(file
     with pytest.raises(SystemExit) as end:
         evaluate.main([str(file), "--num-agents", *sizes])
     assert end.value.code == 130
-    assert list(json.loads(numbers.read_text())["num_agents"]) == ["2", "3"]
+    assert list(json.loads(numbers.read_text())["tables"]) == ["2", "3"]
     capsys.readouterr()
     evaluate.main([str(file), "--num-agents", *sizes])
     assert played == [2, 3, 4, 4]

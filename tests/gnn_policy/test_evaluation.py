@@ -3,7 +3,6 @@
 import io
 import json
 import math
-from dataclasses import asdict
 from itertools import pairwise
 
 import numpy as np
@@ -14,8 +13,8 @@ from rich.console import Console
 import experts
 from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluation, rollout
 from gnn_policy.baselines import GreedyActor, RandomActor
-from gnn_policy.cases import make_cases
-from gnn_policy.evaluation import Estimate, Exam
+from gnn_policy.cases import Family, make_cases
+from gnn_policy.evaluation import LIFELONG_BASELINES, Estimate, Exam
 from gnn_policy.execution import Execution
 from mapf_env import Instance
 
@@ -76,19 +75,18 @@ def corridor(*cells):
 class Walker:
     """Goes right in every step."""
 
-    border, memory = 1, 0
+    def env_settings(self):
+        return {"fov_radius": 1}
 
-    def act(self, teams):
-        return np.full(teams.positions.shape[:2], 3)
+    def act(self, env):
+        return np.full((env.num_envs, env.num_agents), 3)
 
 
-class Dawdler:
+class Dawdler(Walker):
     """Stays twice, then goes right."""
 
-    border, memory = 1, 0
-
-    def act(self, teams):
-        return np.full(teams.positions.shape[:2], 4 if teams.time < 2 else 3)
+    def act(self, env):
+        return np.where(env.times[:, None] < 2, 4, super().act(env))
 
 
 def test_flowtime_increase_by_hand():
@@ -144,9 +142,8 @@ VARIANTS = [
 def compared():
     torch.manual_seed(0)
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))
-    cases = make_cases(
-        "test", seed=0, maps=5, cases_per_map=3, num_agents=4, height=6, width=6, density=0.1, styles=["cells"]
-    )
+    family = Family(num_agents=(4, 4), height=(6, 6), width=(6, 6), density=(0.1, 0.1))
+    cases = make_cases("test", seed=0, maps=5, cases_per_map=3, families=[family]).instances
     exam = Exam.prepare(cases, w=1.05, timeout=3.0, threads=1)
     phases = []
     rows, played = evaluation.compare(exam, policy, VARIANTS, seed=3, progress=phases.append)
@@ -162,17 +159,17 @@ def test_the_comparison_has_a_row_for_each_variant_and_competitor(compared):
     assert phases == [row.name for row in rows[:-1]]  # the expert's row is there before
     settings = {"seed": 3, "max_steps": exam.max_steps}
     for variant, row, seen in zip(VARIANTS, rows, played, strict=False):
-        again = rollout(policy, exam.instances, **asdict(variant), **settings)
+        again = rollout(policy, exam.instances, execution=variant, **settings)
         assert row == evaluation.score(variant.name, exam, again)
         assert np.array_equal(seen.flowtime, again.flowtime)
-    actors = [RandomActor(), GreedyActor(exam.instances), GreedyActor(exam.instances, random_when_stuck=True)]
+    actors = [RandomActor(), GreedyActor(), GreedyActor(random_when_stuck=True)]
     for actor, row in zip(actors, rows[3:6], strict=True):
         assert row == evaluation.score(row.name, exam, rollout(actor, exam.instances, **settings))
 
 
 def test_a_policy_that_sees_the_cost_to_go_is_marked_as_one_that_knows_the_map(compared):
     exam = compared[0]
-    policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2, cost_to_go=True))
+    policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2, extra_channels=("cost_to_go",)))
     rows, _ = evaluation.compare(exam, policy, VARIANTS[:1])
     assert rows[0].name == "argmax*"
 
@@ -226,3 +223,45 @@ def test_the_table_shows_every_figure_within_eighty_columns(compared):
 def test_wilson_narrows_with_more_cases():
     widths = [(e.high - e.low) for n in (10, 100, 1000) for e in [Estimate.proportion(np.arange(n) % 10 != 0)]]
     assert all(one > two for one, two in pairwise(widths))
+
+
+def test_a_lifelong_comparison_is_the_throughput_of_every_row(compared):
+    exam, policy, _, _, _ = compared
+    phases = []
+    table, played = evaluation.compare_lifelong(
+        exam.instances, policy, VARIANTS, steps=30, seed=3, progress=phases.append
+    )
+    names = [*(each.name for each in VARIANTS), "random", "greedy*", "PIBT*"]
+    assert [row["name"] for row in table["rows"]] == phases == names
+    assert (table["cases"], table["steps"]) == (len(exam.instances), 30)
+    players = [*((policy, each) for each in VARIANTS), *((each, None) for each in LIFELONG_BASELINES.values())]
+    for row, (player, execution) in zip(table["rows"], players, strict=True):
+        again = rollout(player, exam.instances, task="lifelong", execution=execution, seed=3, max_steps=30)
+        assert row["throughput"]["mean"] == again.throughput.mean()
+        assert all(len(each.paths) == 31 for each in again.solutions), "a lifelong team never ends before"
+    for variant, seen in zip(VARIANTS, played, strict=True):
+        again = rollout(policy, exam.instances, task="lifelong", execution=variant, seed=3, max_steps=30)
+        assert np.array_equal(seen.throughput, again.throughput)
+    assert json.loads(json.dumps(table, allow_nan=False)) == table
+    shown = io.StringIO()
+    Console(file=shown, width=80).print(evaluation.lifelong_table("teams", table))
+    for row in table["rows"]:
+        assert f"{row['throughput']['mean']:.3f}" in shown.getvalue()
+
+
+def test_throughput_by_hand():
+    """An arrival is a step that ends on the goal that the robot had when it began."""
+    table, _ = evaluation.compare_lifelong(corridor((0, 4)), compared_policy(), [Execution()], steps=40, seed=0)
+    greedy = rollout(GreedyActor(), corridor((0, 4)), task="lifelong", max_steps=40, seed=0)
+    arrivals = sum(
+        bool((cells == goals).all())
+        for cells, goals in zip(greedy.solutions[0].paths[1:], greedy.goals[0][:-1], strict=True)
+    )
+    row = next(row for row in table["rows"] if row["name"] == "greedy*")
+    assert row["throughput"]["mean"] == pytest.approx(arrivals / 40)
+    assert arrivals > 3
+
+
+def compared_policy():
+    torch.manual_seed(0)
+    return DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))

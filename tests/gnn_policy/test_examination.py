@@ -8,7 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, examination
+from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, examination
 from gnn_policy.checkpoint import fingerprint
 from gnn_policy.config import TrainConfig
 from gnn_policy.rollout import Rollouts
@@ -24,7 +24,16 @@ def test_the_animation_shows_the_solved_case_of_median_length():
         paths = [Solution(np.zeros((2, 1, 2), int))] * count
         zeros = np.zeros(count, np.int64)
         return Rollouts(
-            [instance] * count, paths, np.array(success), zeros, np.array(makespans), np.array(success), np.zeros(count)
+            instances=[instance] * count,
+            solutions=paths,
+            goals=[instance.goals[None]] * count,
+            success=np.array(success),
+            flowtime=zeros,
+            makespan=np.array(makespans),
+            on_goal=np.zeros(count),
+            latched=np.array(success),
+            replaced=np.zeros(count),
+            throughput=np.zeros(count),
         )
 
     assert examination._worth_watching(played([True, True, False, True], [9, 4, 5, 6])) == 3
@@ -50,8 +59,8 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [], "a run with results.json counts as finished"
     examination.examine(policy, config, tmp_path, console, threads=1)
     numbers = json.loads((tmp_path / "results.json").read_text())
-    assert numbers["num_agents"]["2"]["cases"] == 4
-    assert [row["name"] for row in numbers["num_agents"]["2"]["rows"]][:4] == [
+    assert numbers["tables"]["2"]["cases"] == 4
+    assert [row["name"] for row in numbers["tables"]["2"]["rows"]][:4] == [
         "argmax",
         "stuck,1",
         "sampled,1",
@@ -60,14 +69,17 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
     assert numbers["settings"] == {
         "policy": fingerprint(policy),
         "variants": ["argmax", "stuck,1", "sampled,1"],
-        "num_agents": [2],
+        "tables": ["2"],
         "split": "test",
+        "task": "one_shot",
         "maps": 2,
         "cases_per_map": 2,
         "height": 5,
         "width": 5,
         "density": 0.0,
         "styles": ["cells"],
+        "families": [],
+        "files": [],
         "data_seed": 0,
         "w": 1.1,
         "timeout": 3.0,
@@ -75,12 +87,13 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
     }
 
 
-def test_the_rows_are_played_under_the_shield_of_training(tmp_path):
+def test_the_rows_are_played_under_the_shield_that_the_policy_says(tmp_path):
     torch.manual_seed(0)
-    policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))
+    execution = Execution(shield="pibt")
+    policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2), execution)
     config = TrainConfig(
-        policy=policy.config, num_agents=2, height=5, width=5, density=0.0, test_maps=1, cases_per_map=1, shield="pibt"
+        policy=policy.config, num_agents=2, height=5, width=5, density=0.0, test_maps=1, cases_per_map=1
     )
     examination.examine(policy, config, tmp_path, Console(file=io.StringIO(), width=80), threads=1)
-    rows = json.loads((tmp_path / "results.json").read_text())["num_agents"]["2"]["rows"]
+    rows = json.loads((tmp_path / "results.json").read_text())["tables"]["2"]["rows"]
     assert [row["name"] for row in rows][:4] == ["argmax,pibt", "stuck,1,pibt", "sampled,1,pibt", "random"]

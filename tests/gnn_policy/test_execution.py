@@ -1,20 +1,23 @@
-"""Ways to execute a policy: names that round-trip, draws, and who is stuck, by a slow reader of the track."""
+"""Ways to execute a policy: names that round-trip, draws, and stuck robots, by a slow reader of the track."""
 
 import itertools
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnn_policy.execution import Execution, hears_of, is_stuck, robot_seeds, uniform
+import strategies
+from gnn_policy import PolicyConfig
+from gnn_policy.execution import Execution, alarmed, gumbel, robot_seeds, uniform
+from mapf_env import HISTORY, BatchedEnv, EnvConfig, Instance, Senses
 
 VARIANTS = st.builds(
     Execution,
     sample=st.sampled_from([False, True, "stuck"]),
     temperature=st.sampled_from([0.3, 1.0, 2.5]),
-    shield=st.sampled_from(["idle", "pibt"]),
+    shield=st.sampled_from(["idle", "pibt", "pibt_swap"]),
     comm_range=st.sampled_from(["fixed", "connected", None]),
     comm_weights=st.sampled_from(["binary", "distance", None]),
 )
@@ -38,12 +41,13 @@ def test_a_name_without_a_shield_has_the_one_that_is_given():
 
 def test_different_variants_have_different_names():
     choices = itertools.product(
-        [False, True, "stuck"], [0.5, 1.0], ["idle", "pibt"], ["fixed", "connected", None], ["binary", "distance", None]
+        *([False, True, "stuck"], [0.5, 1.0], ["idle", "pibt", "pibt_swap"]),
+        *(["fixed", "connected", None], ["binary", "distance", None]),
     )
     fields = ("sample", "temperature", "shield", "comm_range", "comm_weights")
     settings: list[dict[str, Any]] = [dict(zip(fields, each, strict=True)) for each in choices]
     variants = [Execution(**each) for each in settings]
-    assert len({each.name for each in variants if each.sample}) == 2 * 2 * 2 * 9
+    assert len({each.name for each in variants if each.sample}) == 2 * 2 * 3 * 9
     assert Execution().name == "argmax"
     assert Execution(sample=True, temperature=0.5, shield="pibt").name == "sampled,0.5,pibt"
 
@@ -51,11 +55,15 @@ def test_different_variants_have_different_names():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("greedily", "'greedily'.*argmax, sampled, stuck, idle, pibt, fixed, connected, binary, distance or a temp"),
+        (
+            "greedily",
+            "'greedily'.*argmax, sampled, stuck, idle, pibt, pibt_swap, fixed, connected, binary, distance or",
+        ),
         ("", "unknown word ''"),
         ("sampled,stuck", "sample twice"),
         ("sampled,1,2", "temperature twice"),
         ("pibt,idle", "shield twice"),
+        ("pibt,pibt_swap", "shield twice"),
         ("argmax,0.5", "draws nothing"),
         ("0.5", "draws nothing"),
         ("sampled,0", "temperature must be positive"),
@@ -74,54 +82,110 @@ def test_unknown_values_are_refused_by_name(field):
         Execution(**{field: "often"})  # pyright: ignore[reportArgumentType]
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 5), st.integers(0, 6))
-def test_stuck_is_who_stands_off_its_goal_where_it_stood_before(seed, teams, robots, steps):
-    generator = np.random.default_rng(seed)
-    track = generator.integers(0, 2, (steps + 1, teams, robots, 2)).astype(np.int32)
-    goals = generator.integers(0, 2, (teams, robots, 2)).astype(np.int32)
-    stuck = is_stuck(track[-1], goals, track[:-1])
-    assert stuck.shape == (teams, robots)
-    for b, i in itertools.product(range(teams), range(robots)):
-        cells = [tuple(cell) for cell in track[:, b, i].tolist()]
-        assert stuck[b, i] == (cells[-1] in cells[:-1] and cells[-1] != tuple(goals[b, i].tolist()))
+@settings(max_examples=40)
+@given(strategies.instances(max_side=3, min_agents=2, max_agents=4), strategies.seeds, st.integers(0, HISTORY + 4))
+def test_environments_of_an_execution_show_which_robots_are_stuck(instance: Instance, seed, steps):
+    """Off its goal where it stood in one of its last steps: the last scalar, by the track of each robot."""
+    height, width = instance.grid.shape
+    chosen = Execution(sample="stuck").env_settings(PolicyConfig(fov_radius=2, robot_features=("last_moves",)))
+    env = BatchedEnv(1, num_agents=instance.num_agents, height=height, width=width, density=0.0, **chosen)
+    env.reset(seed, instances=[instance])
+    generator, track, goals = np.random.default_rng(seed), [], instance.goals.tolist()
+    while env.running.any() and len(track) < steps:
+        track.append(env.positions[0].tolist())
+        env.step(generator.integers(5, size=(1, instance.num_agents)))
+    if not env.running.any():
+        return
+    here = env.positions[0].tolist()
+    for robot, known in enumerate(env.bag().scalars[:, -1]):
+        before = [then[robot] for then in track[-HISTORY:]]
+        assert known == (here[robot] in before and here[robot] != goals[robot])
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
-def test_who_hears_of_a_stuck_robot(seed, robots):
+def test_an_environment_has_the_senses_of_the_policy_and_the_radio_and_shield_of_the_execution():
+    policy = PolicyConfig(fov_radius=3, comm_weights="distance", robot_features=("on_goal",))
+    own = Execution().senses(policy)
+    assert own == Senses(fov_radius=3, comm_weights="distance", robot_features=("on_goal",))
+    other = Execution(sample="stuck", comm_range="connected", comm_weights="binary", shield="pibt")
+    assert other.senses(policy) == Senses(
+        fov_radius=3, comm_weights="binary", comm_range="connected", robot_features=("on_goal", "stuck")
+    )
+    config = EnvConfig(**other.env_settings(policy))
+    assert config.shield == "pibt"
+    assert config.senses() == other.senses(policy).senses()
+    knows = PolicyConfig(robot_features=("stuck", "on_goal"))
+    assert other.senses(knows).robot_features == ("stuck", "on_goal"), "it is not asked for twice"
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8))
+def test_robots_that_are_stuck_or_hear_one_that_is_are_alarmed(seed, robots):
     generator = np.random.default_rng(seed)
-    stuck = generator.random((3, robots)) < 0.4
-    graph = (generator.random((3, robots, robots)) * (generator.random((3, robots, robots)) < 0.4)).astype(np.float32)
-    heard = hears_of(stuck, graph)
-    for b, i in itertools.product(range(3), range(robots)):
-        assert heard[b, i] == any(stuck[b, j] for j in range(robots) if graph[b, i, j] > 0)
+    stuck = generator.random(robots) < 0.4
+    links = [(j, i) for i in range(robots) for j in range(robots) if i != j and generator.random() < 0.3]
+    heard = alarmed(stuck, np.array(links, np.int64).reshape(-1, 2).T)
+    for i in range(robots):
+        assert heard[i] == (stuck[i] or any(stuck[j] for j, receiver in links if receiver == i))
 
 
 def test_draws_are_uniform_and_depend_on_each_argument():
-    seeds = robot_seeds(np.arange(100, dtype=np.uint64), 5)
-    draws = uniform(seeds, 7, 20)
-    assert draws.shape == (100, 5, 20)
+    teams, robots = np.repeat(np.arange(100, dtype=np.uint64), 5), np.tile(np.arange(5), 100)
+    seeds, at = robot_seeds(teams, robots), np.full(500, 7)
+    draws = uniform(seeds, at, 20)
+    assert draws.shape == (500, 20)
     assert ((draws >= 0) & (draws < 1)).all()
     counts, _ = np.histogram(draws, 10, (0, 1))
     assert abs(counts - 1000).max() < 150
-    assert np.array_equal(uniform(seeds[17:18, 3], 7, 20)[0], draws[17, 3])
-    assert not (uniform(seeds, 8, 20) == draws).any()
-    assert not (uniform(seeds + np.uint64(1000), 7, 20) == draws).any()
+    assert np.array_equal(uniform(seeds[88:89], at[:1], 20)[0], draws[88]), "the other robots play no part"
+    assert not (uniform(seeds, at + 1, 20) == draws).any()
+    assert not (uniform(seeds + np.uint64(1000), at, 20) == draws).any()
     assert len(np.unique(draws)) == draws.size
-    assert np.array_equal(robot_seeds(np.arange(100, dtype=np.uint64), 3), seeds[:, :3]), "robots join, none changes"
+    moments = at + np.arange(500) % 3
+    assert np.array_equal(uniform(seeds, moments, 20)[::3], uniform(seeds[::3], moments[::3], 20))
 
 
-def test_the_values_of_a_robot_that_draws_are_its_tempered_logits_and_standard_gumbel_noise():
+def test_scores_of_a_robot_that_draws_are_its_tempered_logits_and_standard_gumbel_noise():
     logits = np.array([2.0, -1.0, 0.0, 0.5, 1.0], np.float32)
     seeds = np.arange(20_000, dtype=np.uint64)
     many = np.tile(logits, (len(seeds), 1))
-    values = Execution(sample="stuck", temperature=2.0).values(many, seeds % 2 == 0, seeds, 3)
-    assert np.array_equal(values[1::2], many[1::2])
-    noise = values[::2] - logits / 2
-    assert noise.mean() == pytest.approx(np.euler_gamma, abs=0.03)
-    assert noise.var() == pytest.approx(np.pi**2 / 6, abs=0.06)
+
+    def noise(drawn):
+        return gumbel(seeds[drawn], np.full(int(drawn.sum()), 3))
+
+    scores = Execution(sample="stuck", temperature=2.0).scores(many, seeds % 2 == 0, noise)
+    assert np.array_equal(scores[1::2], many[1::2])
+    added = scores[::2] - logits / 2
+    assert added.mean() == pytest.approx(np.euler_gamma, abs=0.03)
+    assert added.var() == pytest.approx(np.pi**2 / 6, abs=0.06)
     # Orders are drawn without replacement: after the first move, the second follows the softmax of the rest.
-    second = np.argsort(-values[::2], axis=1)
+    second = np.argsort(-scores[::2], axis=1)
     rest = second[second[:, 0] == 0, 1]
     weights = np.exp(logits[1:] / 2)
     shares = [(rest == move).mean() for move in range(1, 5)]
     np.testing.assert_allclose(shares, weights / weights.sum(), atol=0.03)
+
+
+@pytest.mark.parametrize("sample", [False, True, "stuck"])
+def test_every_robot_draws_or_no_robot_does_or_those_that_are_alarmed(sample):
+    logits, alarm = np.zeros((6, 5), np.float32), np.arange(6) % 3 == 0
+    asked = []
+
+    def noise(drawn):
+        asked.append(drawn)
+        return np.ones((int(drawn.sum()), 5), np.float32)
+
+    scores = Execution(sample=sample).scores(logits, alarm, noise)
+    drawing = {False: np.zeros(6, bool), True: np.ones(6, bool), "stuck": alarm}[sample]
+    assert (scores == drawing[:, None]).all()
+    assert len(asked) == bool(sample)
+    assert (logits == 0).all(), "the logits are not written to"
+
+
+def test_numbers_that_are_not_finite_are_refused():
+    noise = lambda drawn: np.zeros((int(drawn.sum()), 5), np.float32)  # noqa: E731
+    alarm = np.ones(2, bool)
+    for wrong in (np.nan, np.inf):
+        logits = np.array([[0, 0, 0, 0, 0], [0, wrong, 0, 0, 0]], np.float32)
+        with pytest.raises(ValueError, match="logits are not finite: its weights or what it observes are damaged"):
+            Execution().scores(logits, alarm, noise)
+    with pytest.raises(ValueError, match="the logits over a temperature of 1e-38 are not finite: give a higher one"):
+        Execution(sample=True, temperature=1e-38).scores(np.full((2, 5), 1e9, np.float32), alarm, noise)

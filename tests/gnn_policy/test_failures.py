@@ -121,14 +121,18 @@ def judged(instances, solutions):
     """Rollouts as `rollout` would judge these paths, with T_max 40."""
     on_goal = [(each.paths[-1] == case.goals).all(axis=1) for case, each in zip(instances, solutions, strict=True)]
     times = [np.where(there, each.arrivals, 40) for there, each in zip(on_goal, solutions, strict=True)]
+    nothing = np.zeros(len(instances))
     return Rollouts(
-        instances,
-        solutions,
-        np.array([there.all() for there in on_goal]),
-        np.array([each.sum() for each in times]),
-        np.array([each.max() for each in times]),
-        np.array([there.all() for there in on_goal]),
-        np.zeros(len(instances)),
+        instances=instances,
+        solutions=solutions,
+        goals=[case.goals[None] for case in instances],
+        success=np.array([there.all() for there in on_goal]),
+        flowtime=np.array([each.sum() for each in times]),
+        makespan=np.array([each.max() for each in times]),
+        on_goal=np.array([there.mean() for there in on_goal]),
+        latched=np.array([there.all() for there in on_goal]),
+        replaced=nothing,
+        throughput=nothing,
     )
 
 

@@ -120,11 +120,11 @@ def test_the_last_sound_state_is_kept_and_a_damaged_one_is_not_resumed(tmp_path,
 
 
 @pytest.mark.parametrize("value", BAD)
-@pytest.mark.parametrize("name", ["head.bias", "filter.mix.weight", "encoder.1.running_var"])
+@pytest.mark.parametrize("name", ["head.bias", "graph_layer.mix.weight", "encoder.1.running_var"])
 def test_no_call_takes_weights_that_are_not_finite(policy, tmp_path, capsys, name, value, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file = damaged_file(policy, tmp_path / "bad.safetensors", name, value)
-    with pytest.raises(checkpoint.CheckpointError, match=rf"bad\.safetensors .*not finite .*{name}"):
+    with pytest.raises(checkpoint.CheckpointError, match=rf"bad\.safetensors: .*not finite .*{name}"):
         load(file)
     save_map("own.map", np.zeros((4, 4), bool))
     for command, arguments in ((play, ["own.map", "--agents", "2", "--run", str(file)]), (evaluate, [str(file)])):
@@ -164,38 +164,46 @@ class Network(torch.nn.Module):
         super().__init__()
         self.logit = logit
 
-    def forward(self, fov, graph):
-        logits = torch.zeros(*fov.shape[:2], 5)
-        logits[0, -1, 2] = self.logit
+    def forward(self, bag):
+        logits = torch.zeros(len(bag.fov), 5)
+        logits[int((bag.team == 0).sum()) - 1, 2] = self.logit
         return logits
 
 
 class Scores:
-    border, memory = 1, 0
-
     def __init__(self, score):
         self.score = score
 
-    def act(self, teams):
-        scores = np.zeros((*teams.positions.shape[:2], 5), np.float32)
+    def env_settings(self):
+        return {"fov_radius": 1, "shield": "pibt"}
+
+    def act(self, env):
+        scores = np.zeros((env.num_envs, env.num_agents, 5), np.float32)
         scores[0, 0, 0] = self.score
         return scores
 
 
 @pytest.mark.parametrize("value", BAD)
-@pytest.mark.parametrize("own", [Network, Scores])
 @pytest.mark.parametrize("shield", ["idle", "pibt"])
-def test_logits_and_scores_that_are_not_finite_are_not_played(own, value, shield):
+def test_logits_that_are_not_finite_are_not_played(value, shield):
     cases = [random_instance(height=5, width=5, num_agents=3, seed=seed) for seed in range(2)]
     with pytest.raises(ValueError, match=r"not finite"):
-        rollout(own(value), cases, shield=shield, max_steps=5)
-    rollout(own(1.0), cases, shield=shield, max_steps=5)
+        rollout(Network(value), cases, execution=Execution(shield=shield), max_steps=5)
+    rollout(Network(1.0), cases, execution=Execution(shield=shield), max_steps=5)
+
+
+@pytest.mark.parametrize("value", BAD)
+def test_scores_of_an_actor_that_are_not_finite_are_not_played(value):
+    cases = [random_instance(height=5, width=5, num_agents=3, seed=seed) for seed in range(2)]
+    with pytest.raises(ValueError, match=r"Scores\.act returned values that are not finite"):
+        rollout(Scores(value), cases, max_steps=5)
+    rollout(Scores(1.0), cases, max_steps=5)
 
 
 def test_a_temperature_that_makes_logits_infinite_is_refused():
     cases = [random_instance(height=5, width=5, num_agents=3, seed=0)]
     with pytest.raises(ValueError, match="temperature of 1e-300"):
-        rollout(Network(1.0), cases, sample=True, temperature=1e-300, max_steps=5)
+        rollout(Network(1.0), cases, execution=Execution(sample=True, temperature=1e-300), max_steps=5)
 
 
 def test_a_robot_refuses_views_and_messages_that_are_not_finite(policy):

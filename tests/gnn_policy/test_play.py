@@ -3,7 +3,7 @@
 import json
 import re
 import sys
-from dataclasses import asdict, fields
+from dataclasses import fields
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ import oracles
 from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, play, rollout, save
 from mapf_env import load_scen, random_instance, save_instances, save_map, save_scen
 
-ROLLOUT = sys.modules["gnn_policy.rollout"]  # the name in the package is the function
+LIFELONG = ["--task", "lifelong", "--row", "argmax", "--max-steps", "9"]
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def home(tmp_path, monkeypatch):
     save_scen("elsewhere/far.scen", instance, "own.map")
     torch.manual_seed(0)
     config = PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=3.0)
-    save(DecentralizedPolicy(config), "policy.safetensors")
+    save(DecentralizedPolicy(config, Execution(sample="stuck")), "policy.safetensors")
     return tmp_path
 
 
@@ -80,28 +80,47 @@ def test_every_option_reaches_the_rollout(home, monkeypatch):
     monkeypatch.setattr(
         sys.modules["gnn_policy.rollout"], "rollout", lambda *given, **how: asked.append(how) or rollout(*given, **how)
     )
-    for options in ([], ["--row", "argmax"], ["--row", "sampled,0.5,pibt", "--max-steps", "7"]):
+    for options in ([], ["--row", "argmax"], ["--row", "sampled,0.5,pibt", "--max-steps", "7"], LIFELONG):
         played("own.scen", "--seed", "3", *options)
     instance = load_scen("own.scen")
     longest = max(
         oracles.distances(instance.grid, goal)[start]
         for start, goal in zip(oracles.cells(instance.starts), oracles.cells(instance.goals), strict=True)
     )
-    rows = [Execution(sample="stuck"), Execution(), Execution(sample=True, temperature=0.5, shield="pibt")]
-    limits = [4 * longest, 4 * longest, 7]
-    assert asked == [{"seed": 3, "max_steps": limit, **asdict(row)} for row, limit in zip(rows, limits, strict=True)]
+    rows = [Execution(sample="stuck"), Execution(), Execution(sample=True, temperature=0.5, shield="pibt"), Execution()]
+    limits, tasks = [4 * longest, 4 * longest, 7, 9], ["one_shot"] * 3 + ["lifelong"]
+    assert asked == [
+        {"task": task, "seed": 3, "max_steps": limit, "execution": row}
+        for task, row, limit in zip(tasks, rows, limits, strict=True)
+    ]
 
 
-def test_a_policy_plays_under_the_shield_of_its_training(home, monkeypatch):
+def test_a_policy_plays_as_its_file_says(home, monkeypatch):
     asked = []
     monkeypatch.setattr(
         sys.modules["gnn_policy.rollout"],
         "rollout",
-        lambda *given, **how: asked.append(how["shield"]) or rollout(*given, **how),
+        lambda *given, **how: asked.append(how["execution"]) or rollout(*given, **how),
     )
     for run in ("n12-informed", "n12"):
         play.main(["own.scen", "--run", run, "--threads", "1"])
-    assert asked == ["pibt", "idle"]
+    assert asked == [Execution(sample="stuck", shield="pibt"), Execution(sample="stuck")]
+    play.main(["own.scen", "--run", "n12-informed", "--row", "argmax", "--threads", "1"])
+    assert asked[-1] == Execution(shield="pibt"), "a row keeps the shield of the file unless it names one"
+
+
+def test_a_lifelong_team_goes_on_to_the_last_step_and_its_arrivals_are_reported(home, capsys):
+    instance = load_scen("own.scen")
+    save_scen("rest.scen", instance.at(instance.goals), "own.map")
+    played("rest.scen", "--task", "lifelong", "--max-steps", "25")
+    (scene,) = shown(home / "rest.html")["scenes"]
+    (panel,) = scene["panels"]
+    assert len(panel["paths"]) == 26
+    for before, after in zip(panel["paths"], panel["paths"][1:], strict=False):
+        assert not oracles.faults(instance.grid, oracles.cells(before), oracles.cells(after))
+    told = capsys.readouterr().out
+    assert "arrivals" in told
+    assert "failed" not in told
 
 
 def test_a_scenario_elsewhere_takes_the_first_robots_and_a_map(home):

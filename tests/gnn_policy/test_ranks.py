@@ -46,9 +46,9 @@ with join_ranks() as ranks:
 def launch(tmp_path, name, *, victim=-1, when=-1, config=CONFIG):
     script = tmp_path / "worker.py"
     script.write_text(WORKER)
-    config.save(tmp_path / "settings.json")
+    config.save(tmp_path / "settings.toml")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
-    arguments = [str(tmp_path / name), str(victim), str(when), str(tmp_path / "settings.json")]
+    arguments = [str(tmp_path / name), str(victim), str(when), str(tmp_path / "settings.toml")]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True, timeout=300)
 
@@ -82,7 +82,8 @@ def test_a_round_has_as_many_states_as_that_of_one_process_and_its_halves_differ
         states = Demonstrations.load(whole / "whole" / "demonstrations" / f"round_{number:04d}.safetensors")
         assert len(states) == steps
         half = steps // 2
-        assert states.positions[:half].tobytes() != states.positions[half:].tobytes()
+        robots = half * CONFIG.num_agents
+        assert states.states.positions[:robots].tobytes() != states.states.positions[robots:].tobytes()
 
 
 def test_the_state_and_the_best_policy_are_those_of_the_team(whole):

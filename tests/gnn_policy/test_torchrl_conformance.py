@@ -1,4 +1,4 @@
-"""The PettingZoo environment as TorchRL's own wrapper sees it (here, because only the pupil knows TorchRL)."""
+"""The PettingZoo environment as TorchRL's own wrapper sees it (here, because only `gnn_policy` imports TorchRL)."""
 
 from itertools import pairwise
 from typing import Any
@@ -47,7 +47,7 @@ def test_a_collector_fills_batches_from_it():
         assert done or torch.equal(now["next", "agent", "observation"], later["agent", "observation"])
         moved = now["next", "agent", "observation"][:, 0] != now["agent", "observation"][:, 0]
         idle = now["agent", "action"] == 4
-        assert not moved[idle].any(), "who stays sees the same obstacles"
+        assert not moved[idle].any(), "a robot that stays sees the same obstacles"
 
 
 @pytest.mark.parametrize("shield", ["idle", "pibt"])

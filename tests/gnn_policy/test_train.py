@@ -1,16 +1,19 @@
 """The command that trains: complete help, options of the settings, one line for a mistake."""
 
+import json
 import re
 import subprocess
 import sys
 from dataclasses import fields, replace
 from types import ModuleType
 
+import numpy as np
 import pytest
 
-from gnn_policy import PolicyConfig, results_file, train
+from gnn_policy import Execution, PolicyConfig, load, results_file, train
 from gnn_policy.config import RECIPES, TrainConfig
-from small_training import CONFIG, arguments_for
+from mapf_env import save_map
+from small_training import CONFIG, MIXED, arguments_for
 
 
 def shown_help(capsys, command):
@@ -23,8 +26,9 @@ def shown_help(capsys, command):
 def test_the_help_names_every_setting_and_says_what_it_is(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     text = shown_help(capsys, train.main)
-    options = [each.name for each in fields(TrainConfig) if each.name != "policy"]
-    options += [f"policy.{each.name}" for each in fields(PolicyConfig)] + ["recipe", "run"]
+    options = [each.name for each in fields(TrainConfig) if each.name not in ("policy", "execution", "families")]
+    options += [f"policy.{each.name}" for each in fields(PolicyConfig)] + ["recipe", "config", "run"]
+    options += [f"execution.{each.name}" for each in fields(Execution)]
     for option in options:
         assert f"--{option.replace('_', '-')}" in text, option
     for words in ("T_max in makespans", "Filter taps K", "L2 regularisation", "quick", "paper"):
@@ -42,6 +46,65 @@ def test_an_option_for_every_setting_reaches_the_settings():
     assert quick == replace(RECIPES["quick"], policy=replace(RECIPES["quick"].policy, taps=1))
 
 
+def test_a_file_of_settings_is_the_base_of_the_other_options_and_names_the_run(tmp_path):
+    MIXED.save(tmp_path / "mixed.toml")
+    command = train.parse(["--config", str(tmp_path / "mixed.toml"), "--lr", "0.5", "--policy.taps", "2"])
+    assert command.config == replace(MIXED, lr=0.5, policy=replace(MIXED.policy, taps=2))
+    assert train.parse([f"--config={tmp_path / 'mixed.toml'}"]).config == MIXED
+    (tmp_path / "two.toml").write_text("epochs = 2\n")
+    assert train.parse(["--config", str(tmp_path / "two.toml")]).config == TrainConfig(epochs=2)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "none.toml"),
+        ("epoch = 2", "there is no setting 'epoch': the settings are aggregation"),
+        ("epochs = 0", "epochs must be positive"),
+        ("epochs =", "bad.toml"),
+    ],
+)
+def test_a_file_of_settings_that_is_wrong_takes_one_line(tmp_path, capsys, content, words):
+    file = tmp_path / "none.toml"
+    if content is not None:
+        file = tmp_path / "bad.toml"
+        file.write_text(content)
+    with pytest.raises(SystemExit) as end:
+        train.main(["--config", str(file), "--run", str(tmp_path / "run")])
+    assert end.value.code == 2
+    shown = capsys.readouterr()
+    assert shown.err.startswith("error: ")
+    assert shown.err.count("\n") == 1
+    assert words in shown.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_mixed_families_are_trained_and_examined_by_one_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    MIXED.save(tmp_path / "mixed.toml")
+    train.main(["--config", "mixed.toml"])
+    run = tmp_path / "runs" / "mixed"
+    assert (run / "config.toml").read_text() == MIXED.to_toml()
+    shown = capsys.readouterr().out
+    tables = json.loads((run / "results.json").read_text())["tables"]
+    assert list(tables) == ["2 to 5 robots, family 1 (cells)", "3 to 4 robots, family 2 (maze)"]
+    for title, table in tables.items():
+        assert f"{title}, 2 test maps" in shown
+        assert table["cases"] + table["unsolved_by_expert"] == 4
+    assert load(run).config == MIXED.policy
+    train.main(["--config", "mixed.toml"])
+    assert "holds a finished run" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_run_on_the_users_own_map_shows_one_table(tmp_path, capsys):
+    save_map(tmp_path / "own.map", np.zeros((6, 7), bool))
+    config = replace(CONFIG, files=(str(tmp_path / "own.map"),))
+    train.main(arguments_for(config, tmp_path / "run"))
+    assert "your maps" in capsys.readouterr().out
+    (table,) = json.loads((tmp_path / "run" / "results.json").read_text())["tables"].values()
+    assert table["cases"] == config.cases_per_map
+
+
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
@@ -52,6 +115,9 @@ def test_an_option_for_every_setting_reaches_the_settings():
         ("--device abacus", "abacus"),
         ("--threads 5000", "threads"),
         ("--w 0.5", "w must be"),
+        ("--init nowhere", "nowhere"),
+        ("--init n12 --policy.taps 2", "another network than the one to train .taps: 3, not 2"),
+        ("--files nowhere.map", "nowhere.map"),
     ],
 )
 def test_a_mistake_takes_one_line_and_leaves_no_folder(tmp_path, capsys, wrong, named):
@@ -85,7 +151,7 @@ def test_unknown_options_and_values_are_refused(capsys, wrong):
 
 def test_a_finished_run_is_not_trained_over(tmp_path, capsys):
     arguments = ["--run", str(tmp_path), "--train-maps", "2", "--validation-maps", "1"]
-    train.parse(arguments).config.save(tmp_path / "config.json")
+    train.parse(arguments).config.save(tmp_path / "config.toml")
     (tmp_path / "results.json").write_text("{}")
     with pytest.raises(SystemExit) as end:
         train.main(arguments)

@@ -19,12 +19,13 @@ import torch
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, load, rollout, training
+from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, checkpoint, load, rollout, save, training
 from gnn_policy.demonstrations import BatchMaker, Demonstrations
 from gnn_policy.progress import TrainingProgress
-from gnn_policy.training import Training, open_run, split_cases
+from gnn_policy.run_folder import open_run
+from gnn_policy.training import Training
 from own_layers import Deaf
-from small_training import CONFIG, arguments_for
+from small_training import CONFIG, MIXED, arguments_for
 
 
 class Silence(TrainingProgress):
@@ -67,10 +68,10 @@ def metrics(folder):
 def test_a_graph_layer_of_ones_own_is_trained_and_loaded(tmp_path):
     config = replace(CONFIG, policy=replace(CONFIG.policy, graph_layer="own_layers:Deaf"))
     run = trained(config, tmp_path)
-    assert isinstance(load(tmp_path, plugins=["own_layers:Deaf"]).filter, Deaf)
+    assert isinstance(load(tmp_path, plugins=["own_layers:Deaf"]).graph_layer, Deaf)
     torch.manual_seed(config.seed)
     begun = DecentralizedPolicy(config.policy).state_dict()
-    assert not torch.equal(weights(run)["filter.mix.weight"], begun["filter.mix.weight"])
+    assert not torch.equal(weights(run)["graph_layer.mix.weight"], begun["graph_layer.mix.weight"])
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +95,8 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
         {"teacher": "pibt", "robot_order": "random", "beta_decay": 0.5},
         {"aggregation": "stuck", "teacher": "experts:lacam"},
         {"policy": replace(CONFIG.policy, graph_layer="own_layers:Forgetful")},
+        {"families": MIXED.families, "augment": True, "beta_decay": 0.5},
+        {"families": MIXED.families, "sample_rollouts": "stuck", "execution": Execution(sample="stuck", shield="pibt")},
     ],
 )
 def test_a_run_stopped_after_any_round_goes_on_to_the_same_end(run, tmp_path, settings):
@@ -160,7 +163,9 @@ def test_seconds_are_those_of_the_clock(tmp_path, monkeypatch):
     rows = run.history
     for row in rows:
         labelled = 7 if row.round else 7 * (CONFIG.demonstration_steps // CONFIG.rollout_teams + 1)
-        assert (row.expert_seconds, row.collect_seconds, row.fit_seconds) == (labelled, labelled + 2, 3)
+        assert (row.expert_seconds, row.collect_seconds, row.fit_seconds) == (labelled, labelled + 2, 3 * 2), (
+            "two halves of three batches"
+        )
     spent = [row.collect_seconds + row.fit_seconds for row in rows]
     asked_as_a_collector_starts = 7
     first = 1000 + asked_as_a_collector_starts + spent[0]
@@ -193,7 +198,7 @@ def test_batch_statistics_are_learnt_in_fitting_only(run):
 
 
 def test_validation_is_the_share_of_validation_cases_that_are_solved(run):
-    cases = split_cases(CONFIG, "validation")
+    cases = CONFIG.cases("validation").instances
     exam = training.evaluation.Exam.prepare(cases, w=CONFIG.w, timeout=CONFIG.timeout, threads=1)
     played = rollout(run.policy, cases, max_steps=exam.max_steps, seed=CONFIG.seed)
     assert run.history[-1].validation_success == played.success.mean()
@@ -234,13 +239,95 @@ def batches_seen(monkeypatch, config, folder):
     seen = []
 
     class Watched(BatchMaker):
-        def batch(self, demonstrations, chosen, rng):
-            seen.append((len(demonstrations), chosen))
-            return super().batch(demonstrations, chosen, rng)
+        def prefetched(self, demonstrations, draws, rng, parts=1):
+            seen.extend((len(demonstrations), chosen) for chosen in draws)
+            return super().prefetched(demonstrations, draws, rng, parts)
 
     monkeypatch.setattr(training, "BatchMaker", Watched)
     run = trained(config, folder)
     return run, seen
+
+
+def test_one_batch_holds_teams_and_maps_of_several_sizes(tmp_path, monkeypatch):
+    mixed = []
+    make = BatchMaker.batch
+
+    def watched(self, demonstrations, chosen, rng):
+        batch = make(self, demonstrations, chosen, rng)
+        states = demonstrations.take(chosen).states
+        assert np.bincount(batch["team"]).tolist() == np.diff(states.offsets).tolist()
+        assert len(batch["expert_action"]) == states.num_robots
+        mixed.append((len(set(np.diff(states.offsets))), len(set(states.maps.tolist()))))
+        return batch
+
+    monkeypatch.setattr(BatchMaker, "batch", watched)
+    run = trained(MIXED, tmp_path / "run")
+    assert max(sizes for sizes, _ in mixed) > 2
+    assert max(maps for _, maps in mixed) > 2
+    shard = Demonstrations.load(tmp_path / "run" / "demonstrations" / "round_0000.safetensors")
+    assert set(np.diff(shard.states.offsets).tolist()) <= {2, 3, 4, 5}
+    families = MIXED.cases("train")
+    assert {families.family_of[families.map_of == number][0] for number in set(shard.states.maps.tolist())} == {0, 1}
+    assert run.history[-1].samples > 0
+
+
+def test_training_starts_from_the_weights_that_init_names(run, tmp_path):
+    config = replace(CONFIG, init=str(run.folder), seed=9, lr=1e-12, final_lr=1e-12, epochs=1)
+    begun = Training(config, tmp_path / "run", Silence())
+    assert_equal_weights(weights(begun), load(run.folder).state_dict())
+    begun.run()
+    for name, tensor in load(run.folder).named_parameters():
+        assert torch.allclose(weights(begun)[name], tensor, atol=1e-9), name
+    assert checkpoint.trained_with(tmp_path / "run").init == str(run.folder)
+
+
+def test_a_fine_tuned_run_that_is_resumed_does_not_start_again_from_init(run, tmp_path):
+    class StopError(Exception):
+        pass
+
+    def stop(row):
+        raise StopError
+
+    save(run.policy, tmp_path / "first.safetensors")
+    config = replace(CONFIG, init=str(tmp_path / "first.safetensors"), lr=1e-2)
+    whole = trained(config, tmp_path / "whole")
+    with pytest.raises(StopError):
+        trained(config, tmp_path / "torn", stop)
+    assert_equal_weights(weights(whole), weights(trained(config, tmp_path / "torn")))
+    with pytest.raises(FileExistsError, match=r"other settings \(init\)"):
+        Training(replace(config, init=None), tmp_path / "whole", Silence())
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"taps": 2}, "taps: 3, not 2"),
+        ({"features": 16}, "features: 8, not 16"),
+        ({"extra_channels": ("cost_to_go",)}, r"extra_channels: \(\), not \('cost_to_go',\)"),
+        ({"comm_radius": 4.0, "fov_radius": 3}, "fov_radius: 2, not 3, comm_radius: 3.0, not 4.0"),
+    ],
+)
+def test_init_of_another_network_is_refused_and_the_differences_are_named(run, tmp_path, changes, named):
+    config = replace(CONFIG, policy=replace(CONFIG.policy, **changes), init=str(run.folder))
+    with pytest.raises(ValueError, match=rf"is another network than the one to train \({named}\)") as refusal:
+        Training(config, tmp_path / "run", Silence())
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_policy_of_a_run_is_saved_with_the_execution_of_the_settings(tmp_path):
+    execution = Execution(sample=True, temperature=0.5, shield="pibt", comm_range="connected")
+    run = trained(replace(CONFIG, execution=execution, epochs=2), tmp_path)
+    assert run.policy.execution == load(tmp_path).execution == checkpoint.executed_as(tmp_path) == execution
+
+
+def test_validation_plays_under_the_shield_and_radio_of_the_execution(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(training, "rollout", lambda *given, **how: asked.append(how) or rollout(*given, **how))
+    execution = Execution(sample="stuck", shield="pibt", comm_range="connected")
+    trained(replace(CONFIG, execution=execution, epochs=2), tmp_path / "one")
+    trained(replace(CONFIG, execution=execution, sample_rollouts="stuck", epochs=2), tmp_path / "two")
+    assert [each["execution"] for each in asked] == [replace(execution, sample=False), execution]
 
 
 def test_without_a_number_of_updates_a_round_is_one_pass(tmp_path, monkeypatch):
@@ -278,8 +365,8 @@ def test_plain_imitation_collects_once(tmp_path):
 
 
 def test_an_expert_that_labels_nothing_is_reported(tmp_path, monkeypatch):
-    def helpless(instances, positions, **_):
-        return np.full(positions.shape[:2], 4, np.int8), np.zeros(len(positions), bool)
+    def helpless(instances, positions, *, offsets, **_):
+        return np.full(len(positions), 4, np.int8), np.zeros(len(offsets) - 1, bool)
 
     monkeypatch.setattr("experts.relabel", helpless)
     with pytest.raises(ValueError, match="expert_nodes"):
@@ -300,8 +387,8 @@ def test_a_run_with_other_settings_is_refused_and_they_are_named(tmp_path):
     open_run(tmp_path, CONFIG)
     with pytest.raises(FileExistsError, match=r"other settings \(lr, seed\).*--run"):
         open_run(tmp_path, replace(CONFIG, seed=5, lr=0.1))
-    (tmp_path / "config.json").write_text("{")
-    with pytest.raises(ValueError, match=r"config\.json"):
+    (tmp_path / "config.toml").write_text("{")
+    with pytest.raises(ValueError, match=r"config\.toml"):
         open_run(tmp_path, CONFIG)
 
 
@@ -313,7 +400,7 @@ def test_a_finished_run_is_refused(tmp_path):
 
 
 def test_a_folder_that_another_process_trains_in_is_refused_until_that_one_ends(tmp_path):
-    program = "import sys, pathlib; from gnn_policy.training import lock_run; "
+    program = "import sys, pathlib; from gnn_policy.run_folder import lock_run; "
     program += "lock = lock_run(pathlib.Path(sys.argv[1])); print('locked', flush=True); sys.stdin.read()"
     command = [sys.executable, "-c", program, str(tmp_path / "run")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
@@ -334,6 +421,8 @@ def test_settings_that_do_not_fit_leave_no_folder_behind(tmp_path):
         replace(CONFIG, teacher="nobody"),
         replace(CONFIG, backend="process", collectors=3, rollout_teams=16),
         replace(CONFIG, policy=PolicyConfig(encoder="released", fov_radius=2)),
+        replace(CONFIG, families=(*MIXED.families, replace(MIXED.families[0], num_agents=(100, 120)))),
+        replace(CONFIG, init="n12"),
     ):
         with pytest.raises(ValueError, match=r"\w+ \w+"):
             Training(wrong, tmp_path / "run", Silence())
@@ -378,12 +467,13 @@ def tensorboard_rounds(folder, name):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by POSIX signals")
-def test_a_run_that_is_killed_again_and_again_ends_like_one_that_is_not(tmp_path):
+@pytest.mark.parametrize("config", [CONFIG, MIXED], ids=["one family", "mixed families"])
+def test_a_run_that_is_killed_again_and_again_ends_like_one_that_is_not(tmp_path, config):
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["gnn_policy.train", "gnn_policy.training"])
 
     def launch(folder, writes=0, before=False):
-        names = {"arguments": arguments_for(CONFIG, folder), "writes": writes, "before": before}
+        names = {"arguments": arguments_for(config, folder), "writes": writes, "before": before}
         process = context.Process(target=exec, args=(KILLED_AT_A_WRITE, names))
         process.start()
         return process
@@ -413,7 +503,7 @@ def test_a_run_that_is_killed_again_and_again_ends_like_one_that_is_not(tmp_path
     assert {each.relative_to(torn) for each in torn.rglob("*") if "tfevents" not in each.name} == {
         each.relative_to(whole) for each in whole.rglob("*") if "tfevents" not in each.name
     }
-    for name in ("config.json", "best.safetensors", "results.json", "animation.svg"):
+    for name in ("config.toml", "best.safetensors", "results.json", "animation.svg"):
         assert (torn / name).read_bytes() == (whole / name).read_bytes(), name
     for shard in (whole / "demonstrations").iterdir():
         assert (torn / "demonstrations" / shard.name).read_bytes() == shard.read_bytes()
