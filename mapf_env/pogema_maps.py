@@ -118,9 +118,9 @@ def parse_pogema_map(drawing: str) -> PogemaMap:
 def load_pogema_maps(path: PathLike) -> dict[str, PogemaMap]:
     """Read a file of POGEMA's maps: each map under its name, in the order of the file.
 
-    Of YAML the file has what POGEMA's benchmark uses: a name that begins a block of text, and below it the indented rows
-    of the map; lines that begin with `# ` are comments. A file without names is one map, which gets the name of the
-    file.
+    Of YAML the file has what POGEMA's benchmark uses: a name that begins a block of text, and below it the indented
+    rows of the map; lines that begin with a hash and a blank are comments. A file without names is one map, which gets
+    the name of the file.
 
     Raises:
         ValueError: If the file is damaged; the message names the file and the line.
