@@ -57,8 +57,8 @@ struct PibtScratch {
           actions(num_agents) {}
 };
 
-// Executes the orders of preference in `scratch`, with swaps as PibtStep::decide takes them. Robots that have been under way (N) for longest come first, equal ones
-// in the order that `key` draws. `blocked` is the map in its layout, pad >= 1.
+// Executes the orders of preference in `scratch`, with swaps as PibtStep::decide takes them. Robots that have been under
+// way (N) for longest come first, equal ones in the order that `key` draws. `blocked` is the map in its layout, pad >= 1.
 template <class T, class Swaps = NoSwaps>
 void pibt_shield(const Layout& layout, const T* blocked, const std::int32_t* positions, const std::int32_t* under_way,
                  int num_agents, std::uint64_t key, PibtScratch<T>& scratch, std::int8_t* executed,

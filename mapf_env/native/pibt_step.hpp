@@ -91,17 +91,21 @@ private:
     template <class Swaps>
     bool plan(int robot, int pusher, const Swaps& swaps) {
         const int cell = cells_[robot];
-        auto candidates = candidates_of(robot);
+        const std::uint8_t* wanted = preferences_.data() + robot * num_actions;
+        int count = num_actions, partner = nobody;
         // Swap: the robot that has to give way takes its candidates in reverse order, which leads it out backwards.
-        int partner = nobody;
+        [[maybe_unused]] Candidates candidates;
         if constexpr (Swaps::on) {
+            candidates = candidates_of(robot);
             partner = swap_partner(robot, cell + steps_[candidates.action[0]], swaps);
             if (partner != nobody) std::reverse(candidates.action.begin(), candidates.action.begin() + candidates.count);
+            wanted = candidates.action.data();
+            count = candidates.count;
         }
-        for (int rank = 0; rank < candidates.count; ++rank) {
-            const std::uint8_t action = candidates.action[rank];
+        for (int rank = 0; rank < count; ++rank) {
+            const std::uint8_t action = wanted[rank];
             const int target = cell + steps_[action];
-            if (next_[target] != nobody) continue;
+            if (blocked_[target] != T{0} || next_[target] != nobody) continue;
             const int other = now_[target];
             const bool occupied = other != nobody && other != robot;
             if (occupied && actions_[other] != undecided && cells_[other] + steps_[actions_[other]] == cell) continue;
@@ -122,13 +126,13 @@ private:
     }
 
     struct Candidates {
-        std::array<std::uint8_t, num_actions> action;
-        int count;
+        std::array<std::uint8_t, num_actions> action{};
+        int count = 0;
     };
 
     // The actions that stay on the map, in the order of preference.
     Candidates candidates_of(int robot) const {
-        Candidates candidates{{}, 0};
+        Candidates candidates;
         for (int rank = 0; rank < num_actions; ++rank) {
             const std::uint8_t action = preferences_[robot * num_actions + rank];
             if (blocked_[cells_[robot] + steps_[action]] == T{0}) candidates.action[candidates.count++] = action;
