@@ -16,10 +16,10 @@ from gnn_policy.cases import Task
 from gnn_policy.command_line import run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
-from mapf_env import EnvConfig, Instance, distances, replay
+from mapf_env import EnvConfig, Instance, Scene, distances, replay_scenes
 from mapf_env.arguments import integer
 from mapf_env.files import require_outputs, unused
-from mapf_env.problem_file import load_problem
+from mapf_env.problem_file import PROBLEM_SUFFIXES, load_problem
 
 if TYPE_CHECKING:
     from gnn_policy.rollout import Rollouts
@@ -33,8 +33,8 @@ class Command:
     """Play a policy on a map of your own and write a page that replays it in any browser."""
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """A map (.map) in the MovingAI format, a scenario (.scen) next to its map, a set of instances (.json), or maps of
-    POGEMA (.yaml)."""
+    """A map (.map) in the MovingAI format, a scenario (.scen) next to its map, a set of instances (.json), maps of
+    POGEMA (.yaml), or a folder of these."""
     agents: int | None = None
     """How many robots: placed at random on a map, else the first ones of the file (all of them if not given)."""
     run: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: n12)")] = checkpoint.PACKAGED
@@ -80,11 +80,12 @@ def _play(command: Command) -> None:
     threads = cpu_threads(command.threads)
     execution = checkpoint.executed_as(command.run)
     if command.row is not None:
-        execution = Execution.parse(command.row, execution.shield)
-    instance = load_problem(
-        command.file, agents=command.agents, map=command.map, index=command.index, seed=command.seed
-    )
-    steps = _patience(instance) if command.max_steps is None else integer(command.max_steps, "max_steps", 1)
+        execution = Execution.parse(command.row, execution)
+    problems = _problems(command)
+    if command.max_steps is None:
+        steps = [_patience(instance) for instance in problems.values()]
+    else:
+        steps = [integer(command.max_steps, "max_steps", 1)] * len(problems)
     out = command.out or unused(Path(f"{command.file.stem}.html"))
     require_outputs([out], [command.file, command.map])
 
@@ -96,36 +97,74 @@ def _play(command: Command) -> None:
     torch.set_num_threads(threads)
     policy = on_device(checkpoint.load(command.run, plugins=command.plugins), command.device)
     console = Console()
-    size = f"{instance.num_agents} robots on {instance.grid.shape[0]} x {instance.grid.shape[1]} cells"
     before = time.perf_counter()
-    with console.status(f"{size}, {steps} steps at most"):
-        played = rollout(policy, [instance], task=command.task, execution=execution, seed=command.seed, max_steps=steps)
+    with console.status(f"{len(problems)} teams, {max(steps)} steps at most"):
+        played = rollout(
+            policy,
+            list(problems.values()),
+            task=command.task,
+            execution=execution,
+            seed=command.seed,
+            max_steps=steps,
+        )
     seconds = time.perf_counter() - before
-    (solution,) = played.solutions
-    told = f"{size}: {_outcome(command.task, played)}"
-    replay(
-        instance,
-        solution,
-        out,
-        title=told,
-        config=EnvConfig(**execution.env_settings(policy.config)),
-        goals=played.goals[0] if command.task == "lifelong" else None,
-    )
-    console.print(f"{told} ({seconds:.1f} s)", highlight=False)
+    outcomes = [_outcome(command.task, played, number) for number in range(len(problems))]
+    scenes = [
+        Scene(
+            f"{name}: {outcome}" if len(problems) > 1 else "",
+            instance,
+            {"": solution},
+            {"": goals} if command.task == "lifelong" else {},
+        )
+        for name, outcome, instance, solution, goals in zip(
+            problems, outcomes, played.instances, played.solutions, played.goals, strict=True
+        )
+    ]
+    title = outcomes[0] if len(problems) == 1 else f"{len(problems)} teams of {command.file}"
+    replay_scenes(scenes, out, title=title, config=EnvConfig(**execution.env_settings(policy.config)))
+    for scene in scenes if len(problems) > 1 else []:
+        console.print(scene.title, highlight=False)
+    console.print(f"{title} ({seconds:.1f} s)", highlight=False)
     console.print(f"replay: {out}", highlight=False, soft_wrap=True)
 
 
-def _outcome(task: Task, played: Rollouts) -> str:
+def _problems(command: Command) -> dict[str, Instance]:
+    """Return the instance of the file, or of each file of a folder, by the file's name.
+
+    Raises:
+        ValueError: If a file is damaged, an option is missing or not for it, or a folder has nothing to play.
+        OSError: If a file cannot be read.
+    """
+    if not command.file.is_dir():
+        files = [command.file]
+    elif command.map is not None or command.index is not None:
+        raise ValueError(f"--map and --index go with one file, and {command.file} is a folder")
+    else:  # without --agents there are no robots to place on maps
+        kinds = PROBLEM_SUFFIXES if command.agents is not None else {".scen", ".json"}
+        files = sorted(each for each in command.file.iterdir() if each.suffix.lower() in kinds)
+        if not files:
+            raise ValueError(
+                f"the folder {command.file} has no scenarios (.scen) and no sets of instances (.json): "
+                "for maps give --agents"
+            )
+    return {
+        file.name: load_problem(file, agents=command.agents, map=command.map, index=command.index, seed=command.seed)
+        for file in files
+    }
+
+
+def _outcome(task: Task, played: Rollouts, number: int) -> str:
     from gnn_policy.failures import failure
 
-    (instance,), (solution,) = played.instances, played.solutions
+    instance, solution = played.instances[number], played.solutions[number]
+    size = f"{instance.num_agents} robots on {instance.grid.shape[0]} x {instance.grid.shape[1]} cells"
     steps = len(solution.paths) - 1
     if task == "lifelong":
-        return f"{played.throughput[0]:.2f} arrivals a step over {steps} steps"
+        return f"{size}: {played.throughput[number]:.2f} arrivals a step over {steps} steps"
     home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
     kind = failure(instance, solution)
     end = f"flowtime {solution.sum_of_costs}" if kind is None else f"failed: {kind}"
-    return f"{home} on goal after {steps} steps, {end}"
+    return f"{size}: {home} on goal after {steps} steps, {end}"
 
 
 def _patience(instance: Instance) -> int:

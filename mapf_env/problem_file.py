@@ -11,6 +11,9 @@ from mapf_env.instance_set import InstanceSet, load_instances
 from mapf_env.movingai import load_map, load_scen
 from mapf_env.pogema_maps import load_pogema_maps
 
+PROBLEM_SUFFIXES = frozenset({".map", ".scen", ".json", ".yaml"})
+"""The kinds of files that hold maps or instances."""
+
 
 def load_problem(file: PathLike, *, agents: int | None, map: PathLike | None, index: int | None, seed: int) -> Instance:
     """The instance that a file and the options beside it define; messages speak of the options by their names there.
@@ -63,7 +66,7 @@ def load_problems(path: PathLike) -> list[tuple[Obstacles, list[Instance]]]:
     """
     place = Path(path)
     if place.is_dir():
-        files = sorted(each for each in place.iterdir() if each.suffix.lower() in (".scen", ".map", ".json", ".yaml"))
+        files = sorted(each for each in place.iterdir() if each.suffix.lower() in PROBLEM_SUFFIXES)
         if not files:
             raise ValueError(
                 f"the folder {path} has no maps (.map, .yaml), scenarios (.scen) or sets of instances (.json)"

@@ -90,7 +90,7 @@ def test_every_option_reaches_the_rollout(home, monkeypatch):
     rows = [Execution(sample="stuck"), Execution(), Execution(sample=True, temperature=0.5, shield="pibt"), Execution()]
     limits, tasks = [4 * longest, 4 * longest, 7, 9], ["one_shot"] * 3 + ["lifelong"]
     assert asked == [
-        {"task": task, "seed": 3, "max_steps": limit, "execution": row}
+        {"task": task, "seed": 3, "max_steps": [limit], "execution": row}
         for task, row, limit in zip(tasks, rows, limits, strict=True)
     ]
 
@@ -156,7 +156,7 @@ def test_a_team_that_is_home_has_solved_it(home, capsys):
         ("elsewhere/far.scen --map own.map --out own.map", "own.map would overwrite the input own.map"),
         ("none.map --agents 3", "none.map"),
         ("none.scen", "none.scen"),
-        ("elsewhere --agents 3", "must be a map"),
+        ("elsewhere --agents 3 --map own.map", "go with one file"),
         ("policy.safetensors --agents 3", "must be a map"),
         ("own.scen --run none", "none"),
     ],
@@ -191,3 +191,29 @@ def test_a_page_that_nobody_named_replaces_no_file(home, capsys):
     assert (home / "own.html").read_text() == "mine"
     played("own.scen", "--max-steps", "3", "--out", "own.html")
     assert shown(home / "own.html")
+
+
+def test_the_files_of_a_folder_are_scenes_of_one_page(home, capsys):
+    instances = [random_instance(height=5, width=5, num_agents=3, seed=seed) for seed in range(2)]
+    save_instances("elsewhere/set.json", instances)
+    save_map("elsewhere/own.map", load_scen("own.scen").grid)
+    save_scen("elsewhere/far.scen", load_scen("own.scen"), "elsewhere/own.map")
+    played("elsewhere", "--max-steps", "5")
+    data, told = shown(home / "elsewhere.html"), capsys.readouterr().out
+    assert [scene["title"].partition(":")[0] for scene in data["scenes"]] == ["far.scen", "set.json"]
+    assert data["scenes"][1]["goals"] == instances[0].goals.tolist()
+    assert "far.scen: 6 robots on 9 x 12 cells: " in told
+    assert "set.json: 3 robots on 5 x 5 cells: " in told
+
+    played("elsewhere", "--agents", "2", "--max-steps", "5", "--out", "maps.html")
+    assert len(shown(home / "maps.html")["scenes"]) == 3  # and the map
+
+
+def test_a_folder_without_instances_is_refused_in_one_line(home, capsys):
+    (home / "maps").mkdir()
+    save_map("maps/own.map", load_scen("own.scen").grid)
+    for options, message in ((["maps"], "for maps give --agents"), (["maps", "--index", "0"], "go with one file")):
+        with pytest.raises(SystemExit) as end:
+            played(*options)
+        assert end.value.code == 2
+        assert message in capsys.readouterr().err
