@@ -178,7 +178,7 @@ class Experiment:
     def executions(self, model: Model, own_size: bool) -> list[Execution]:
         """How a model is executed, on teams of the size it was trained on or of others."""
         names = (*self.options.rows, *(self.options.own_size_rows if own_size else ()))
-        return [Execution.parse(name, model.config.execution.shield) for name in names]
+        return [Execution.parse(name, Execution(shield=model.config.execution.shield)) for name in names]
 
     def run_of(self, model: Model) -> Path:
         """The run folder of a model."""

@@ -82,7 +82,7 @@ swap (Okumura 2023)."""
 
 def _policy(path: str, row: str) -> Method:
     policy = checkpoint.load(path)
-    execution = Execution.parse(row, policy.execution.shield) if row else policy.execution
+    execution = Execution.parse(row, policy.execution) if row else policy.execution
     name = f"{Path(path).name.removesuffix('.safetensors')} {execution.name}"
     settings = {"policy": checkpoint.fingerprint(policy), "row": execution.name}
     return _step_by_step(name, settings, PolicyActor(policy.eval(), execution))

@@ -102,6 +102,11 @@ def act(policy: nn.Module, observation: Any, execution: Execution, rng: np.rando
     if isinstance(observation, TensorDictBase):
         return torch.from_numpy(dense(_stacked(observation["agents"], lambda part: part.cpu().numpy())))
     if isinstance(observation, Mapping) and observation:
+        if not all(isinstance(name, str) and name.rpartition("_")[2].isdigit() for name in observation):
+            raise TypeError(
+                "act takes the observations of parallel_env by agent, not those of joint_env or of one agent: make the "
+                "environment with parallel_env"
+            )
         agents = sorted(observation, key=lambda name: int(name.rpartition("_")[2]))  # rows of the graph are by number
         if not all(isinstance(observation[agent], Mapping) for agent in agents):
             raise ValueError('the agents observe views alone: make the environment with observation="dict"')

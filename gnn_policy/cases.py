@@ -203,12 +203,14 @@ def _place(
     return [each for each in instances if each is not None]
 
 
-def cases_of_files(split: Split, files: Sequence[str], *, seed: int, cases_per_map: int, num_agents: int) -> Cases:
+def cases_of_files(
+    split: Split, files: Sequence[str], *, seed: int, cases_per_map: int, num_agents: int, whole: bool = False
+) -> Cases:
     """Return the cases of a split of the user's own maps, scenarios and sets of instances.
 
     If there are at least three maps, one in ten of them, but at least one, is kept for each of validation and test.
     Otherwise the splits share the maps: on a map without instances each split draws its own starts and goals; of given
-    instances one in ten goes to each of validation and test.
+    instances one in ten goes to each of validation and test. With `whole` nothing is kept apart.
 
     Raises:
         ValueError: If a file is damaged, or the files leave a split without a case.
@@ -221,12 +223,12 @@ def cases_of_files(split: Split, files: Sequence[str], *, seed: int, cases_per_m
             found.instances.extend(instances)
     number = get_args(Split).index(split)
     grids = [found.grid for found in maps.values()]
-    by_map = len(maps) >= 3
+    by_map = len(maps) >= 3 and not whole
     mine = [k for k in range(len(maps)) if not by_map or _turn(k, len(maps)) == number]
     instances, map_of = [], []
     for k in mine:
         given = list(maps.values())[k].instances
-        if given and not by_map:
+        if given and not by_map and not whole:
             given = [each for i, each in enumerate(given) if _turn(i, len(given)) == number]
         elif not given:
             stream = mix(np.array([seed], np.uint64), np.array([3 * k + number], np.uint64))

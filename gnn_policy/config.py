@@ -32,8 +32,8 @@ class TrainConfig:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     """The network and what it perceives."""
     init: str | None = None
-    """Start from the weights of a policy: a run folder, a .safetensors file, or the name of a packaged policy. The
-    network, its senses and its execution are then that policy's. Random weights if not given."""
+    """Start from the weights of a policy: a run folder, a .safetensors file, or the name of a packaged policy. As an
+    option it also takes the network, its senses and its execution from there. Random weights if not given."""
 
     num_agents: int = 10
     """Robots N in a training team."""
@@ -52,8 +52,9 @@ class TrainConfig:
     """Families of random cases with ranges of sizes, densities and team sizes, instead of the five settings above; in a
     configuration file, one [[families]] table for each."""
     files: tuple[str, ...] = ()
-    """Your own maps (.map), scenarios (.scen) and sets of instances (.json), or folders of them, instead of random
-    maps. The splits share no map if there are three or more; otherwise they share maps, but no starts and goals."""
+    """Your own maps (.map, .yaml), scenarios (.scen) and sets of instances (.json), or folders of them, instead of
+    random maps. The splits share no map if there are three or more; otherwise they share maps, but neither starts nor
+    goals."""
     train_maps: int = 420
     """Maps for training."""
     validation_maps: int = 90
@@ -66,6 +67,8 @@ class TrainConfig:
     """Cases on each validation map."""
     timeout: float = 3.0
     """T_max in makespans of the expert's solution."""
+    exam_nodes: int = 200_000
+    """Nodes that ECBS may generate for a validation or test case before LaCAM plans it; take fewer for crowds."""
 
     teacher: str = "ecbs"
     """The solver that shows the moves: "ecbs", "lacam", "prioritised", "pibt", or one of your own as
@@ -148,7 +151,7 @@ class TrainConfig:
         check_types(self)
         positive = (
             "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
-            "expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
+            "exam_nodes expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
             "rollout_teams plan_steps hard_case_mining collectors lr final_lr validate_every"
         )
         for name in positive.split():
@@ -187,8 +190,8 @@ class TrainConfig:
         )
         return self.families or tuple(replace(alike, style=style) for style in self.styles)
 
-    def cases(self, split: Split) -> Cases:
-        """Return the cases of a split.
+    def cases(self, split: Split, *, whole: bool = False) -> Cases:
+        """Return the cases of a split; with `whole` all cases of the files, if there are files.
 
         Raises:
             ValueError: If there is no room for the robots, or a file does not fit.
@@ -197,7 +200,12 @@ class TrainConfig:
         maps, cases_per_map = self.size_of(split)
         if self.files:
             return cases_of_files(
-                split, self.files, seed=self.data_seed, cases_per_map=cases_per_map, num_agents=self.num_agents
+                split,
+                self.files,
+                seed=self.data_seed,
+                cases_per_map=cases_per_map,
+                num_agents=self.num_agents,
+                whole=whole,
             )
         return make_cases(
             split, seed=self.data_seed, maps=maps, cases_per_map=cases_per_map, families=self.case_families

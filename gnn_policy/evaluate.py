@@ -36,8 +36,8 @@ class Command:
     """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled" or "stuck"
     (stuck robots and their neighbours sample); for the latter two a temperature; the shield, "idle", "pibt" or
     "pibt_swap"; the radio's range, "fixed" or "connected" (the radius grows until the team is connected); edge weights,
-    "binary" or "distance". Where a row does not say, the shield is the policy's own, and range and weights are those of
-    training. If not given: argmax, stuck and sampled."""
+    "binary" or "distance". Where a row does not say, the policy's own execution does. If not given: argmax, stuck and
+    sampled."""
     split: Literal["validation", "test"] = "test"
     """Which maps: "validation" to choose a row by, "test" to report it."""
     maps: int | None = None
@@ -54,8 +54,8 @@ class Command:
     """Obstacles: independent "cells", short "walls", or "maze", "room", "warehouse" and "empty", which heed no
     density; the maps take turns among the styles."""
     files: tuple[str, ...] = ()
-    """Your own maps (.map), scenarios (.scen) and sets of instances (.json), or folders of them, instead of random
-    maps."""
+    """Your own maps (.map, .yaml), scenarios (.scen) and sets of instances (.json), or folders of them, instead of
+    random maps; all their cases are played."""
     task: Task | None = None
     """"one_shot", or "lifelong": a robot that arrives gets a new goal, and the tables show throughput."""
     steps: int = 256
@@ -100,21 +100,23 @@ def _evaluate(command: Command) -> None:
     names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
     given = {name: value for name in names if (value := getattr(command, name)) is not None}
     if given.keys() & {"height", "width", "density", "styles"}:
-        given["families"] = ()
+        given |= {"families": (), "files": ()}
     prefix = "validation_" if command.split == "validation" else ""
     if command.maps is not None:
         given[f"{command.split}_maps"] = command.maps
     if command.cases_per_map is not None:
         given[f"{prefix}cases_per_map"] = command.cases_per_map
     if command.files:
-        given["files"] = command.files
+        given |= {"families": (), "files": command.files}
+    if command.files and len(command.num_agents) > 1:
+        raise ValueError("files have their own teams: give one --num-agents at most, for maps without instances")
     if command.task is not None:
         given["task"] = command.task
     config = replace(trained, **given)
     execution = checkpoint.executed_as(command.run)
     variants = variants_of(execution)
     if command.rows is not None:
-        variants = [Execution.parse(row, execution.shield) for row in command.rows]
+        variants = [Execution.parse(row, execution) for row in command.rows]
     threads = cpu_threads(command.threads)
     folder = command.out or _home(command.run)
     if folder.exists() and not folder.is_dir():
@@ -139,6 +141,7 @@ def _evaluate(command: Command) -> None:
         variants=variants,
         split=command.split,
         task=config.task,
+        whole=bool(command.files),
         steps=command.steps,
         threads=threads,
         failures=command.failures,

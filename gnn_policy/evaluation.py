@@ -19,6 +19,8 @@ from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.rollout import Rollouts, rollout
 from mapf_env import Instance, Solution
 
+LIFELONG_STEPS = 256
+"""Steps of a lifelong episode in validation, and by default in evaluation."""
 EXAM_NODES = 200_000
 """High-level nodes that the expert may generate for a held-out case; several seconds of search."""
 
@@ -64,15 +66,30 @@ class Exam:
     """Cases left out because the expert did not solve them within its limits."""
 
     @staticmethod
-    def prepare(instances: Sequence[Instance], *, w: float, timeout: float, threads: int) -> Exam:
+    def prepare(
+        instances: Sequence[Instance], *, w: float, timeout: float, threads: int, nodes: int = EXAM_NODES
+    ) -> Exam:
         """Solve the cases by the expert; T_max is `timeout` times the makespan of its solution.
 
-        Which cases it solves depends on `EXAM_NODES`, not on the machine.
+        LaCAM plans the cases that ECBS leaves. The cases that are solved depend on `nodes`, not on the machine.
+
+        Args:
+            instances: The cases.
+            w: ECBS's bound on suboptimality.
+            timeout: T_max in makespans of the expert's solution.
+            threads: CPU threads.
+            nodes: Nodes that ECBS, and then LaCAM, may generate for a case.
 
         Raises:
             ValueError: If the expert solves none of them.
         """
-        results = experts.solve_many(instances, w=w, threads=threads, time_limit=math.inf, node_limit=EXAM_NODES)
+        limits: dict[str, Any] = {"threads": threads, "time_limit": math.inf, "node_limit": nodes}
+        results = experts.solve_many(instances, w=w, **limits)
+        left = [i for i, result in enumerate(results) if not result.solved]
+        for i, plan in zip(
+            left, experts.solve_many([instances[i] for i in left], solver="lacam", **limits), strict=True
+        ):
+            results[i] = plan
         known = [i for i, result in enumerate(results) if result.solved]
         if not known:
             raise ValueError(f"the expert solved none of the {len(instances)} cases: make them easier or raise w")
@@ -84,6 +101,12 @@ class Exam:
             np.array([max(math.ceil(timeout * solution.makespan), 1) for solution in solutions]),
             len(instances) - len(known),
         )
+
+    @staticmethod
+    def without_expert(instances: Sequence[Instance], max_steps: int) -> Exam:
+        """Return cases of lifelong tasks, which have no solution and end after `max_steps`."""
+        limits = np.full(len(instances), max_steps, np.int64)
+        return Exam(list(instances), [], np.zeros(0, np.int64), limits, 0)
 
     @property
     def flowtimes(self) -> npt.NDArray[np.int64]:

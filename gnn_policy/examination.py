@@ -38,7 +38,8 @@ def examine(
     variants: Sequence[Execution] | None = None,
     split: Split = "test",
     task: Task = "one_shot",
-    steps: int = 256,
+    steps: int = evaluation.LIFELONG_STEPS,
+    whole: bool = False,
     threads: int,
     failures: int = 0,
 ) -> None:
@@ -57,6 +58,7 @@ def examine(
         split: Which maps.
         task: "lifelong" shows throughput, without the expert.
         steps: Steps of a lifelong episode.
+        whole: Play all cases of the files, also those that a training on them would have kept for itself.
         threads: CPU threads of the expert.
         failures: How many cases of the first variant to show next to the expert's solutions, for each table, in
             failures.html; the worst of each kind of failure come first. With them every table is computed.
@@ -82,7 +84,7 @@ def examine(
     refuse_other_settings(numbers, settings, "--out")
     tables = read_tables(numbers)
     finished = set() if failures or tables.keys() >= cases.keys() else tables.keys() & cases.keys()
-    held_out = {name: each.cases(split).instances for name, each in cases.items() if name not in finished}
+    held_out = {name: each.cases(split, whole=whole).instances for name, each in cases.items() if name not in finished}
     show = evaluation.table if task == "one_shot" else evaluation.lifelong_table
     rivals = evaluation.BASELINES if task == "one_shot" else evaluation.LIFELONG_BASELINES
     scenes: list[Scene] = []
@@ -103,7 +105,9 @@ def examine(
                 )
             else:
                 progress.update(bar, description=f"{title}: expert")
-                exam = evaluation.Exam.prepare(held_out[name], w=config.w, timeout=config.timeout, threads=threads)
+                exam = evaluation.Exam.prepare(
+                    held_out[name], w=config.w, timeout=config.timeout, threads=threads, nodes=config.exam_nodes
+                )
                 rows, shown = evaluation.compare(exam, policy, variants, seed=config.seed, progress=advance)
                 progress.advance(bar)
                 kinds = {each.name: count_failures(played) for each, played in zip(variants, shown, strict=True)}
@@ -130,7 +134,7 @@ def _animate(shown: Sequence[Rollouts], path: Path) -> None:
     outcome = "all on goal" if best.success[case] else "timed out"
     if lifelong:
         outcome = f"{best.throughput[case]:.2f} arrivals a step"
-    title = f"Trained policy, {best.instances[case].num_agents} robots, unseen map: {outcome}"
+    title = f"Trained policy, {best.instances[case].num_agents} robots: {outcome}"
     goals = best.goals[case] if lifelong else None
     animate(best.instances[case], best.solutions[case], path, title=title, goals=goals)
 

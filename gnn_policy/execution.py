@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -115,12 +115,12 @@ class Execution:
         return ",".join([*words, *(each for each in (self.comm_range, self.comm_weights) if each)])
 
     @staticmethod
-    def parse(text: str, shield: Shield = "idle") -> Execution:
+    def parse(text: str, base: Execution | None = None) -> Execution:
         """Return the variant of the given name, its words in any order.
 
         Args:
             text: The words.
-            shield: The shield if no word names one.
+            base: Gives the shield, the radio and the temperature where no word does; the defaults if not given.
 
         Raises:
             ValueError: If a word is unknown or contradicts another.
@@ -133,7 +133,7 @@ class Execution:
             given[option] = value
         if "temperature" in given and not given.get("sample"):
             raise ValueError(f"the variant {text!r} has a temperature but draws nothing: say sampled or stuck")
-        return Execution(**{"shield": shield, **given})
+        return replace(Execution() if base is None else base, **{"sample": False, **given})
 
 
 _WORD_OF_SAMPLE = {False: "argmax", True: "sampled", "stuck": "stuck"}

@@ -158,7 +158,7 @@ class DecentralizedPolicy(nn.Module):
             observation: What `parallel_env` (a dictionary by agent), `BatchedEnv` (an `Observation` or a `Bag`) or
                 `TeamEnv` (a TensorDict) returned.
             execution: How moves are chosen from logits; the policy's own if not given.
-            seed: Of the draws; a generator goes on with its stream.
+            seed: Seed of the draws. In a loop give one generator for all calls: the same number repeats the same draws.
 
         Returns:
             One action for each robot in the form that the environment's `step` takes: a dictionary by agent, an array
@@ -166,7 +166,7 @@ class DecentralizedPolicy(nn.Module):
             action: (5,), (B, N, 5) or (M, 5); `parallel_env` takes them with preferences=True.
 
         Raises:
-            ValueError: If the observation lacks something that the policy reads.
+            ValueError: If views, scalars or edge features have other shapes than those that the policy reads.
             TypeError: If it is something else.
         """
         return act(self, observation, execution or self.execution, np.random.default_rng(seed))

@@ -24,7 +24,7 @@ def settings_of(
 ) -> dict[str, Any]:
     """Return everything that the numbers depend on, except for the policy."""
     maps, cases_per_map = config.size_of(split)
-    names = ("height", "width", "density", "data_seed", "w", "timeout", "seed")
+    names = ("height", "width", "density", "data_seed", "w", "timeout", "exam_nodes", "seed")
     return {
         "variants": [variant.name for variant in variants],
         "tables": list(tables_of(config, num_agents)),
@@ -102,5 +102,7 @@ def write_tables(path: Path, settings: dict[str, Any], tables: dict[str, dict[st
 
 def table_title(name: str, settings: dict[str, Any]) -> str:
     """Return the heading of a table."""
+    if settings["files"]:
+        return name
     cases = f"{name} robots" if name.isdigit() else name
     return f"{cases}, {settings['maps']} {settings['split']} maps"

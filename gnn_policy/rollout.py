@@ -17,7 +17,7 @@ from gnn_policy.execution import Execution, gumbel, robot_seeds
 from gnn_policy.finite import require_finite
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.policy_config import PolicyConfig
-from mapf_env import Action, BatchedEnv, Instance, Solution
+from mapf_env import Action, BatchedEnv, Instance, Solution, arguments
 from mapf_env.hashing import mix
 
 _MOST_BYTES = 2**28
@@ -132,8 +132,11 @@ def rollout(
         ValueError: If an argument is out of range, or the policy needs more memory than there is for one team.
         TypeError: If `policy` is neither a network nor an actor.
     """
+    instances = list(arguments.each_of(instances, Instance, "instances"))
     if not instances:
         raise ValueError("there are no instances to play")
+    if execution is not None:
+        arguments.instance_of(execution, Execution, "execution")
     if batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {batch_size}")
     limits = np.array(_one_for_each("max_steps", max_steps, len(instances)), np.int64)

@@ -53,14 +53,15 @@ class _Defaults:
 def parse(arguments: Sequence[str]) -> Command:
     """Return the command that the arguments ask for.
 
-    The recipe or the file of settings among them decides the other defaults; a policy to start from decides the
-    network, its senses and its execution.
+    The recipe or the file of settings among them decides the other defaults; `--init` decides the network, its senses
+    and its execution.
     """
     chosen, _ = tyro.cli(_Defaults, args=arguments, return_unknown_args=True, add_help=False)
     config = RECIPES[chosen.recipe] if chosen.file is None else TrainConfig.load(chosen.file)
-    init = config.init if chosen.init is None else chosen.init
-    if init is not None:
-        config = replace(config, policy=checkpoint.config_of(init), execution=checkpoint.executed_as(init))
+    if chosen.init is not None:  # a file of settings with `init` has the policy and execution that belong to it
+        config = replace(
+            config, policy=checkpoint.config_of(chosen.init), execution=checkpoint.executed_as(chosen.init)
+        )
     return tyro.cli(
         Command, args=arguments, default=Command(config, chosen.recipe, chosen.file), prog="python -m gnn_policy.train"
     )

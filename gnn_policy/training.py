@@ -134,11 +134,7 @@ class Training:
     def run(self) -> None:
         """Train all remaining rounds."""
         config, first = self.config, self.ranks.rank == 0
-        exam = (
-            evaluation.Exam.prepare(self._validation, w=config.w, timeout=config.timeout, threads=self.threads)
-            if first
-            else None
-        )
+        exam = self._exam() if first else None
         batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
         demonstrator = Demonstrator(config, self.policy, self._teacher, self._cases, self.ranks)
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
@@ -164,6 +160,14 @@ class Training:
             if writer is not None:
                 writer.close()
                 self._lock.release()
+
+    def _exam(self) -> evaluation.Exam:
+        config = self.config
+        if config.task == "lifelong":
+            return evaluation.Exam.without_expert(self._validation, evaluation.LIFELONG_STEPS)
+        return evaluation.Exam.prepare(
+            self._validation, w=config.w, timeout=config.timeout, threads=self.threads, nodes=config.exam_nodes
+        )
 
     def _round(
         self, number: int, demonstrator: Demonstrator, batches: BatchMaker, exam: evaluation.Exam | None

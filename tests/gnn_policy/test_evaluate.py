@@ -96,6 +96,7 @@ def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path, split
         "split": split,
         "task": "one_shot",
         "steps": 256,
+        "whole": False,
         "threads": 1,
         "failures": 2,
     }
@@ -123,7 +124,9 @@ def test_the_rows_of_a_policy_are_its_own_execution_drawn_in_three_ways(file, mo
     _, _, how = examined(monkeypatch, str(file))
     assert how["variants"] == [replace(execution, sample=sample) for sample in (False, "stuck", True)]
     _, _, how = examined(monkeypatch, str(file), "--rows", "stuck")
-    assert how["variants"] == [Execution(sample="stuck", shield="pibt")]
+    assert how["variants"] == [replace(execution, sample="stuck")]
+    _, _, how = examined(monkeypatch, str(file), "--rows", "stuck,1,idle,binary")
+    assert how["variants"] == [Execution(sample="stuck", comm_weights="binary")]
 
 
 def test_families_of_training_have_a_table_each_unless_a_map_is_asked_for(file, monkeypatch, capsys):
@@ -162,7 +165,7 @@ def test_the_users_files_are_examined(file, tmp_path, capsys, split):
     evaluate.main([str(file), "--files", str(tmp_path / "set.json"), "--split", split, "--out", str(out)])
     results = json.loads((out / "results.json").read_text())
     assert list(results["tables"]) == ["your maps"]
-    assert results["tables"]["your maps"]["cases"] == 2
+    assert results["tables"]["your maps"]["cases"] == 20
     assert results["settings"]["files"] == [str(tmp_path / "set.json")]
     assert "your maps" in capsys.readouterr().out
 

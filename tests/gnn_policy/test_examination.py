@@ -83,6 +83,7 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
         "data_seed": 0,
         "w": 1.1,
         "timeout": 3.0,
+        "exam_nodes": 200_000,
         "seed": 0,
     }
 

@@ -34,8 +34,10 @@ def test_names_round_trip_with_their_words_in_any_order(variant, random):
 
 
 def test_a_name_without_a_shield_has_the_one_that_is_given():
-    assert Execution.parse("stuck", "pibt") == Execution(sample="stuck", shield="pibt")
-    assert Execution.parse("stuck,idle", "pibt") == Execution(sample="stuck")
+    assert Execution.parse("stuck", Execution(shield="pibt", temperature=0.5, sample=True)) == Execution(
+        sample="stuck", shield="pibt", temperature=0.5
+    )
+    assert Execution.parse("stuck,idle", Execution(shield="pibt")) == Execution(sample="stuck")
     assert Execution.parse("stuck") == Execution(sample="stuck")
 
 
