@@ -59,7 +59,7 @@ class Options:
     lifelong: bool = False
     """Measure the throughput over 256 steps instead: a robot on its goal gets the next of those that POGEMA draws."""
     methods: tuple[str, ...] = ("pibt", "n12-informed")
-    """What to play: "pibt"; "pibt_swap"; "greedy"; "lacam", its first plan within two seconds, or "lacam,SECONDS", its
+    """Methods: "pibt"; "pibt_swap"; "greedy"; "lacam", its first plan within two seconds, or "lacam,SECONDS", its
     plan improved for that long; "rolling", plans of a few steps, or "rolling,ROUNDS", improved for so many rounds; a
     policy by its name, file or run folder, or with a row of gnn_policy.evaluate, as in "n12-informed,argmax" (executed
     as its file says if no row is given)."""
@@ -88,7 +88,7 @@ class Cell:
 
     @property
     def title(self) -> str:
-        """What the progress bar says."""
+        """The text of the progress bar."""
         return f"{self.group.name}, {self.num_agents} robots: {self.method.name}"
 
 

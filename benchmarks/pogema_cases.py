@@ -120,7 +120,7 @@ class Published:
     method: str
     num_agents: int
     results: Mapping[str, float]
-    """Of `MEASURES`, those that are known."""
+    """The measures of `MEASURES` that are known."""
 
 
 def load_published(path: Path) -> list[Published]:
@@ -148,7 +148,7 @@ def _published(row: dict[str | Any, str | Any], where: str) -> Published:
 
 
 def _values(block: str, key: str, path: Path) -> list[str]:
-    """What a key of the configuration is set to: one value, or the list of its grid search."""
+    """Return the values of a key of the configuration: one value, or the list of its grid search."""
     found = re.search(
         rf"^[ ]+{key}:[ ]*(?:\n[ ]+grid_search:\s*)?(\[[^\]]*\]|[^\s\[\]{{}}#]+)[ ]*$", block, re.MULTILINE
     )
@@ -188,7 +188,7 @@ def _check(cases: list[Case], num_agents: int, path: Path) -> None:
 
 
 def _differences(cases: list[Case], columns: list[np.ndarray]) -> Iterator[str]:
-    """What differs in each case; empty where nothing does."""
+    """Return the differences of each case; empty where there are none."""
     for case, name, seed, shape, grid, starts, goals in zip(cases, *columns, strict=True):
         found = case.instance
         height, width = found.grid.shape

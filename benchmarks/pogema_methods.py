@@ -1,4 +1,4 @@
-"""What can be played on POGEMA's instances: policies, PIBT, greedy robots and LaCAM, each by name.
+"""The methods that can be played on POGEMA's instances: policies, PIBT, greedy robots and LaCAM, each by name.
 
 A method is written as its name and options with commas between them: "pibt", "lacam,2", "rolling,200",
 "n12-informed,argmax".
@@ -28,7 +28,7 @@ FIRST_PLAN_LIMIT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """What became of C teams by the benchmark's rules."""
+    """The outcomes of C teams by the benchmark's rules."""
 
     success: npt.NDArray[np.bool_]
     """(C,) all robots are on their goals at once within T (CSR)."""
@@ -48,11 +48,11 @@ class Method:
 
     name: str
     settings: Mapping[str, object]
-    """What its results depend on besides the instances, T and the seed."""
+    """Everything that its results depend on besides the instances, T and the seed."""
     play: Callable[[Sequence[Instance], int, int], Played]
     """Play instances of any map sizes for at most T steps with a seed."""
     serve: Callable[[Instance, npt.NDArray[np.int32], int, int], int] | None
-    """Serve goals for ever: an instance, the goals (N, K, 2) that follow its own, steps and a seed in, the number of
+    """Serve goals forever: an instance, the goals (N, K, 2) that follow its own, steps and a seed in, the number of
     arrivals out; None if the method cannot."""
 
 

@@ -38,7 +38,7 @@ class Score:
     method: str
     cases: int
     measures: dict[str, Estimate]
-    """Of `LABELS`, those of the task."""
+    """The labels of `LABELS` for the task."""
     step_seconds: float
     """Wall-clock time of the method over the joint steps of all teams; teams are played in batches."""
 

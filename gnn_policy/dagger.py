@@ -23,7 +23,7 @@ from gnn_policy.acting import scores_of
 from gnn_policy.cases import Cases
 from gnn_policy.config import Backend, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
-from gnn_policy.execution import gumbel, robot_seeds
+from gnn_policy.execution import episode_noise
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
 from gnn_policy.ranks import Ranks
@@ -91,10 +91,7 @@ class Mixture(TensorDictModuleBase):
         bag = perceive(replace(states, maps=maps), self._maps, self._senses)
         team = states.team
         robot = np.arange(states.num_robots) - states.offsets[team]
-
-        def noise(drawn: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-            return gumbel(robot_seeds(states.seeds[team[drawn]], robot[drawn]), states.times[team[drawn]])
-
+        noise = episode_noise(states.seeds[team], states.times[team], robot)
         with autocast(self.config.precision, self.policy.head.weight.device):
             return scores_of(self.policy, bag, self.config.rollout_execution, noise)
 

@@ -175,6 +175,19 @@ def gumbel(seeds: Seeds, times: npt.NDArray[np.integer]) -> Logits:
     return -np.log(-np.log(uniform(seeds, times, len(Action)).clip(1e-12, 1 - 1e-12))).astype(np.float32)
 
 
+def episode_noise(
+    seeds: Seeds, times: npt.NDArray[np.integer], robots: npt.NDArray[np.integer]
+) -> Callable[[Flags], Logits]:
+    """Return the noise that `Execution.scores` takes, as each robot draws it in its episode.
+
+    Args:
+        seeds: (M,) the seed of each robot's episode.
+        times: (M,) steps since its start.
+        robots: (M,) the robot's number in its team.
+    """
+    return lambda drawn: gumbel(robot_seeds(seeds[drawn], robots[drawn]), times[drawn])
+
+
 def uniform(seeds: Seeds, times: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.float64]:
     """Return draws (M, count) from [0, 1) that depend only on each seed and time, both (M,)."""
     counters = times.astype(np.uint64)[:, None] * np.uint64(count) + np.arange(count, dtype=np.uint64)

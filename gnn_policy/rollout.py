@@ -13,7 +13,7 @@ from torch import nn
 
 from gnn_policy.acting import scores_of
 from gnn_policy.cases import Task
-from gnn_policy.execution import Execution, gumbel, robot_seeds
+from gnn_policy.execution import Execution, episode_noise
 from gnn_policy.finite import require_finite
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.policy_config import PolicyConfig
@@ -65,10 +65,7 @@ class PolicyActor:
         """Observe, communicate and score the moves."""
         robots = env.present & env.running[:, None]
         team, robot = np.nonzero(robots)
-
-        def noise(drawn: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-            return gumbel(robot_seeds(env.seeds[team[drawn]], robot[drawn]), env.times[team[drawn]])
-
+        noise = episode_noise(env.seeds[team], env.times[team], robot)
         scores = np.zeros((*robots.shape, len(Action)), np.float32)
         scores[robots] = scores_of(self.policy, env.bag(), self.execution, noise)
         return scores if self.execution.shield != "idle" else scores.argmax(-1)
