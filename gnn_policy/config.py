@@ -23,6 +23,7 @@ RobotOrder = Literal["index", "random", "farthest", "nearest"]
 Aggregation = Literal["visited", "stuck", "plans"]
 Backend = Literal["direct", "process"]
 Precision = Literal["auto", "float32", "bfloat16"]
+Optimizer = Literal["adam", "adamw"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,6 +82,9 @@ class TrainConfig:
     numbers, "random" in each state, or by the Manhattan distance to their goals, "farthest" or "nearest" first."""
     expert_nodes: int = 2000
     """Nodes that ECBS or LaCAM may generate to label a state; unlabelled states are counted and left out."""
+    expert_rounds: int = 400
+    """Rounds of the neighbourhood search that improves LaCAM's plans in an aggregation of "plans"; more rounds give
+    cheaper plans and take longer."""
 
     epochs: int = 150
     """Rounds of collecting and fitting; round 0 imitates the expert, the others aggregate what the policy visits."""
@@ -88,6 +92,9 @@ class TrainConfig:
     """Gradient steps in a round; without a number, one pass in which every demonstrated state is seen once."""
     batch_size: int = 64
     """Team states in a gradient step."""
+    batch_robots: int | None = None
+    """Robot states in a gradient step, for teams of mixed sizes: so many teams are drawn as have this number of robots
+    together, where their sizes allow it. Needs `updates_per_epoch`; `batch_size` is then not used."""
     demonstration_steps: int = 524_288
     """Team steps played in round 0, by the expert."""
     aggregation: Aggregation = "visited"
@@ -95,6 +102,8 @@ class TrainConfig:
     authors' code does; or the first steps of "plans" from some of the visited states, which costs the expert least."""
     plan_steps: int = 24
     """Steps of each plan that are labelled in an aggregation of "plans"."""
+    stuck_weight: float = 1.0
+    """How many times more often such a plan starts where a robot is stuck than where none is."""
     dagger_every: int = 4
     """Rounds from one aggregation to the next; 0 for plain imitation."""
     dagger_steps: int = 32_768
@@ -105,6 +114,8 @@ class TrainConfig:
     """With a number of steps: share of a batch drawn from the newest states; the rest comes from all of them."""
     fresh_window: int = 65_536
     """How many states count as the newest."""
+    kept_states: int | None = None
+    """How many of the newest states are kept; older ones are forgotten. All are kept if not given."""
     rollout_length: int = 64
     """Steps that a team plays in a round."""
     rollout_teams: int = 128
@@ -124,14 +135,21 @@ class TrainConfig:
     augment: bool = False
     """Turn and reflect every demonstrated state at random."""
 
+    optimizer: Optimizer = "adam"
+    """"adamw" applies the weight decay to the weights, "adam" adds it to their gradients."""
     lr: float = 1e-3
-    """Adam's first learning rate."""
+    """The first learning rate."""
     final_lr: float = 1e-6
     """The learning rate at the end of the cosine decay."""
     beta1: float = 0.9
     """Adam's momentum."""
     weight_decay: float = 1e-5
-    """L2 regularisation."""
+    """Strength of the weight decay."""
+    clip_norm: float | None = None
+    """Scale gradients down to this norm; not clipped if not given."""
+    averaging: float | None = None
+    """Keep an exponential moving average of the weights with this decay per gradient step. The average plays in the
+    rollouts, is validated and is saved; if not given, the weights themselves."""
 
     validate_every: int = 5
     """Rounds from one validation to the next."""
@@ -152,7 +170,7 @@ class TrainConfig:
         positive = (
             "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
             "exam_nodes expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
-            "rollout_teams plan_steps hard_case_mining collectors lr final_lr validate_every"
+            "rollout_teams plan_steps hard_case_mining collectors lr final_lr validate_every expert_rounds stuck_weight"
         )
         for name in positive.split():
             if not 0 < getattr(self, name) < math.inf:
@@ -162,8 +180,18 @@ class TrainConfig:
                 raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)}")
         for name in ("density", "beta_decay", "fresh_share"):
             share(getattr(self, name), name)
-        if not 0 <= self.beta1 < 1:
-            raise ValueError(f"beta1 must lie in [0, 1), got {self.beta1}")
+        for name in ("beta1", "averaging"):
+            if (value := getattr(self, name)) is not None and not 0 <= value < 1:
+                raise ValueError(f"{name} must lie in [0, 1), got {value}")
+        if self.clip_norm is not None and not 0 < self.clip_norm < math.inf:
+            raise ValueError(f"clip_norm must be positive and finite, got {self.clip_norm}")
+        if self.kept_states is not None and self.kept_states < 1:
+            raise ValueError(f"kept_states must be at least 1, got {self.kept_states}")
+        if self.batch_robots is not None and (self.batch_robots < 1 or self.updates_per_epoch is None):
+            raise ValueError(
+                f"batch_robots must be at least 1 and needs updates_per_epoch, got {self.batch_robots} and "
+                f"{self.updates_per_epoch}"
+            )
         for name in ("seed", "data_seed"):
             if getattr(self, name) >= 2**64:
                 raise ValueError(f"{name} must be below 2**64, got {getattr(self, name)}")

@@ -170,7 +170,8 @@ class Demonstrator:
         """
         seed = int(np.random.SeedSequence([self._config.seed, round_number, self._rank]).generate_state(1)[0])
         if round_number == 0 and self._config.aggregation == "plans":
-            return self._teacher.demonstrate(self._starts(steps, np.random.default_rng(seed)))
+            starts = self._starts(steps, np.random.default_rng(seed))
+            return self._teacher.demonstrate(starts, self._config.plan_steps)
         self._mixture.begin(self._config.beta_decay**round_number, seed)
         if self._config.backend != "direct":
             self._collector.update_policy_weights_(self._mixture)
@@ -190,10 +191,11 @@ class Demonstrator:
             chosen = chosen[chosen["next", "truncated"][:, 0]]
             return self._teacher.demonstrate(states_of(chosen, self._map_of))
         if aggregation == "plans":
-            rng = np.random.default_rng(seed)
-            asked = rng.permutation(len(chosen))[: max(len(chosen) // config.plan_steps, 1)]
-            states = states_of(chosen[torch.from_numpy(np.sort(asked))], self._map_of)
-            return self._teacher.demonstrate(states, config.plan_steps)
+            states = states_of(chosen, self._map_of)
+            weight = np.where(np.logical_or.reduceat(states.stuck(), states.offsets[:-1]), config.stuck_weight, 1.0)
+            count = max(len(states) // config.plan_steps, 1)
+            asked = np.random.default_rng(seed).choice(len(states), count, replace=False, p=weight / weight.sum())
+            return self._teacher.demonstrate(states.take(np.sort(asked)), config.plan_steps)
         return self._teacher.label(states_of(chosen, self._map_of))
 
     def _starts(self, steps: int, rng: np.random.Generator) -> States:

@@ -20,7 +20,8 @@ from gnn_policy.imitation import EXPERT_ACTION
 from mapf_env import MapSet, Senses, States, perceive
 from mapf_env.files import replacing
 
-LEAST = 4
+Parts = Sequence[npt.NDArray[np.integer]]
+"""The states of a batch by their numbers, in parts whose gradients are computed side by side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,28 +115,77 @@ class BatchMaker:
         labels = symmetry.turn_actions(picked.actions, turn_of).astype(np.int64)
         return TensorDict({**tensors(bag)._asdict(), EXPERT_ACTION: torch.from_numpy(labels)})
 
-    def prefetched(
-        self,
-        demonstrations: Demonstrations,
-        draws: Sequence[npt.NDArray[np.integer]],
-        rng: np.random.Generator,
-        parts: int = 1,
+    def batches(
+        self, demonstrations: Demonstrations, draws: Sequence[Parts], rng: np.random.Generator, *, ahead: bool
     ) -> Iterator[list[TensorDict]]:
-        """Yield the batch of each of `draws`, in parts; the next one is made while the one before is in use.
+        """Yield the parts of each batch that was drawn.
 
-        Batches of fewer than `LEAST` states are not divided, so that batch norm always has several robots.
+        Args:
+            demonstrations: The states to draw from.
+            draws: The numbers of the states in each batch.
+            rng: Draws the symmetries.
+            ahead: Make the next batch while the one before is in use. That pays where another device computes; a CPU
+                whose cores are all busy only loses time by it.
         """
 
-        def make(chosen: npt.NDArray[np.integer]) -> list[TensorDict]:
-            pieces = np.array_split(chosen, parts if len(chosen) >= LEAST else 1)
-            return [self.batch(demonstrations, piece, rng) for piece in pieces]
+        def make(parts: Parts) -> list[TensorDict]:
+            return [self.batch(demonstrations, chosen, rng) for chosen in parts]
 
+        if not ahead:
+            yield from map(make, draws)
+            return
         with ThreadPoolExecutor(1) as maker:
-            ahead = None
-            for chosen in draws:
-                after = maker.submit(make, chosen)
-                if ahead is not None:
-                    yield ahead.result()
-                ahead = after
-            if ahead is not None:
-                yield ahead.result()
+            waiting = None
+            for parts in draws:
+                after = maker.submit(make, parts)
+                if waiting is not None:
+                    yield waiting.result()
+                waiting = after
+            if waiting is not None:
+                yield waiting.result()
+
+
+_ATTEMPTS = 8
+
+
+class Filler:
+    """Draws states of teams of any sizes that have a given number of robots together.
+
+    The operations of a network are fastest on arrays of always the same size.
+
+    Args:
+        sizes: (M,) the robots in each state.
+        newest: The first of the states that count as new.
+        fresh_share: Share of the draws among the new states; the others are among all.
+        rng: Makes the draws.
+    """
+
+    def __init__(
+        self, sizes: npt.NDArray[np.integer], newest: int, fresh_share: float, rng: np.random.Generator
+    ) -> None:
+        self._sizes, self._newest, self._fresh_share, self._rng = sizes, newest, fresh_share, rng
+        order = sizes.argsort(kind="stable")
+        kinds, first = np.unique(sizes[order], return_index=True)
+        self._of_size = dict(zip(kinds.tolist(), np.split(order, first[1:]), strict=True))
+
+    def __call__(self, robots: int) -> npt.NDArray[np.intp]:
+        """Return states with exactly so many robots, or with somewhat fewer where no team has the missing number."""
+        for _ in range(_ATTEMPTS):
+            drawn, filled = self._draw(robots)
+            for number in range(len(drawn), max(len(drawn) - 2, -1), -1):
+                missing = robots - int(filled[number])
+                if missing == 0:
+                    return drawn[:number]
+                if missing in self._of_size:
+                    return np.append(drawn[:number], self._rng.choice(self._of_size[missing]))
+        drawn, _ = self._draw(robots)
+        return drawn if len(drawn) else self._rng.integers(len(self._sizes), size=1)
+
+    def _draw(self, robots: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.integer]]:
+        """Return as many states as fit, n of them, and how many robots the first 0..n of them have."""
+        count = robots // min(self._of_size)
+        first = np.where(self._rng.random(count) < self._fresh_share, self._newest, 0)
+        drawn = self._rng.integers(first, len(self._sizes))
+        filled = np.append(0, self._sizes[drawn].cumsum())
+        most = int(filled.searchsorted(robots, side="right")) - 1
+        return drawn[:most], filled[: most + 1]

@@ -28,6 +28,7 @@ class Teacher:
         w: ECBS's bound on suboptimality; other solvers are asked without one.
         robot_order: The order in which it is given the robots of a state; it breaks ties by that.
         node_limit: ECBS's and LaCAM's effort for a state.
+        rounds: Rounds of the neighbourhood search where the first steps of plans are labelled.
         threads: CPU threads.
         clock: The clock that `seconds` are measured by.
 
@@ -43,11 +44,12 @@ class Teacher:
         w: float,
         robot_order: RobotOrder = "index",
         node_limit: int,
+        rounds: int = 400,
         threads: int,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._grids, self._w, self._robot_order = grids, w, robot_order
-        self._node_limit, self._threads, self._clock = node_limit, threads, clock
+        self._node_limit, self._rounds, self._threads, self._clock = node_limit, rounds, threads, clock
         self._solver = solver if solver in SOLVER_NAMES else import_by_name(solver, "the teacher", SOLVER_NAMES)
         self.seconds = 0.0
         """Time that it has taken to answer, so far."""
@@ -153,7 +155,12 @@ class Teacher:
         began = self._clock()
         order = self._order(states)
         labels = experts.label_plans(
-            self._instances(states, order), steps=steps, w=self._w, node_limit=self._node_limit, threads=self._threads
+            self._instances(states, order),
+            steps=steps,
+            w=self._w,
+            node_limit=self._node_limit,
+            rounds=self._rounds,
+            threads=self._threads,
         )
         self.seconds += self._clock() - began
         parts = [Demonstrations(states.take(np.empty(0, np.intp)), np.empty(0, np.int8))]

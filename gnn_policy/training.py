@@ -18,18 +18,20 @@ and writes the run folder and validates.
 from __future__ import annotations
 
 import csv
+import math
 import pickle
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from tensordict import TensorDict
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
 from gnn_policy import checkpoint, evaluation
@@ -37,7 +39,7 @@ from gnn_policy.command_line import on_device
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
 from gnn_policy.dagger import Demonstrator, teams_side_by_side
-from gnn_policy.demonstrations import BatchMaker, Demonstrations
+from gnn_policy.demonstrations import BatchMaker, Demonstrations, Filler, Parts
 from gnn_policy.finite import require_finite
 from gnn_policy.half_batches import HalfBatches
 from gnn_policy.imitation import EXPERT_ACTION, ImitationLoss
@@ -90,7 +92,14 @@ class Training:
         self.loss = ImitationLoss(ranks.average_gradients(self.policy))
         alone = ranks.count == 1 and self.policy.head.weight.device.type == "cpu"
         self._halves = HalfBatches(self.policy, self.loss, config.precision, self.threads) if alone else None
-        self.optimizer = torch.optim.Adam(
+        self._averaged = (
+            AveragedModel(self.policy, multi_avg_fn=get_ema_multi_avg_fn(config.averaging), use_buffers=True)
+            if config.averaging is not None
+            else None
+        )
+        self._player = self.policy if self._averaged is None else cast(DecentralizedPolicy, self._averaged.module)
+        optimizer = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[config.optimizer]
+        self.optimizer = optimizer(
             self.policy.parameters(),
             lr=config.lr,
             betas=(config.beta1, 0.999),
@@ -109,6 +118,7 @@ class Training:
             w=config.w,
             robot_order=config.robot_order,
             node_limit=config.expert_nodes,
+            rounds=config.expert_rounds,
             threads=self.threads,
             clock=clock,
         )
@@ -128,7 +138,7 @@ class Training:
         if found is not None:
             self._restore(found)
         if ranks.rank == 0:
-            self._shards = [Demonstrations.load(self._shard(r)) for r in range(len(self.history)) if self._collects(r)]
+            self._shards = self._kept_shards()
         self._shards = ranks.from_first(self._shards)
 
     def run(self) -> None:
@@ -136,7 +146,7 @@ class Training:
         config, first = self.config, self.ranks.rank == 0
         exam = self._exam() if first else None
         batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
-        demonstrator = Demonstrator(config, self.policy, self._teacher, self._cases, self.ranks)
+        demonstrator = Demonstrator(config, self._player, self._teacher, self._cases, self.ranks)
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
@@ -184,6 +194,8 @@ class Training:
                 collected.save(self._shard(number))
             self._shards.append(collected)
         demonstrations = Demonstrations.concatenate(self._shards)
+        if config.kept_states is not None and len(demonstrations) > config.kept_states:
+            demonstrations = demonstrations.take(np.arange(-config.kept_states, 0) + len(demonstrations))
         self._shards = [demonstrations]
         if len(demonstrations) == 0:
             raise ValueError("the expert solved none of the visited states: raise expert_nodes or make cases easier")
@@ -216,6 +228,15 @@ class Training:
         row.seconds = self._seconds_before + self._clock() - self._began
         return row
 
+    def _kept_shards(self) -> list[Demonstrations]:
+        """Read the demonstrations of the rounds so far, as far back as they are kept."""
+        shards: list[Demonstrations] = []
+        limit = math.inf if self.config.kept_states is None else self.config.kept_states
+        for number in reversed(range(len(self.history))):
+            if self._collects(number) and sum(map(len, shards)) < limit:
+                shards.insert(0, Demonstrations.load(self._shard(number)))
+        return shards
+
     def _collects(self, number: int) -> bool:
         every = self.config.dagger_every
         return number == 0 or (every > 0 and number % every == 0)
@@ -226,16 +247,18 @@ class Training:
         rng = np.random.default_rng([config.seed, number])
         draws_of_network = np.random.SeedSequence([config.seed, number, self.ranks.rank]).generate_state(1)
         torch.manual_seed(int(draws_of_network[0]))  # as dropout makes them
-        draws = self._pass(demonstrations, rng) if config.updates_per_epoch is None else self._draw(demonstrations, rng)
+        draws = self._draw(demonstrations, rng)
         updates = len(draws)
         self.policy.train()
         figures = torch.zeros(updates, 2, device=self.policy.head.weight.device)  # which stay there for a round
         robots = 0
-        own = [chosen[self.ranks.rank :: self.ranks.count] for chosen in draws]
-        halves = 1 if self._halves is None else 2
-        for update, parts in enumerate(batches.prefetched(demonstrations, own, rng, halves)):
+        for update, parts in enumerate(batches.batches(demonstrations, draws, rng, ahead=figures.device.type != "cpu")):
             figures[update] = self._backward([part.to(figures.device) for part in parts])
+            if config.clip_norm is not None:
+                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), config.clip_norm)
             self.optimizer.step()
+            if self._averaged is not None:
+                self._averaged.update_parameters(self.policy)
             robots += sum(len(part[EXPERT_ACTION]) for part in parts)
             if self.progress.due() or update + 1 == updates:
                 losses = figures[: update + 1, 0].cpu().numpy()
@@ -243,7 +266,8 @@ class Training:
                     raise self._diverged(number, "the loss is not a finite number")
                 self.progress.fitted(number, update + 1, updates, losses, robots)
         if self.ranks.count > 1:  # the last batch's statistics are each process's own
-            self.policy.load_state_dict(self.ranks.from_first(self.policy.state_dict()))
+            for module in filter(None, (self.policy, self._averaged)):
+                module.load_state_dict(self.ranks.from_first(module.state_dict()))
         try:
             self._require_finite()
         except ValueError as damage:
@@ -265,6 +289,7 @@ class Training:
     def _require_finite(self) -> None:
         """Check the weights, the batch statistics and the optimiser's moments."""
         require_finite(self.policy.state_dict())
+        require_finite(self._player.state_dict())
         for number, moments in self.optimizer.state_dict()["state"].items():
             tensors = {f"{name} of parameter {number}": value for name, value in moments.items()}
             require_finite({name: value for name, value in tensors.items() if torch.is_tensor(value)}, "Adam's moments")
@@ -276,23 +301,40 @@ class Training:
             "choose a smaller --lr (or --weight-decay) and another folder with --run"
         )
 
-    def _pass(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[npt.NDArray[np.intp]]:
-        """Every state once, in random order."""
-        order = rng.permutation(len(demonstrations))
-        return np.array_split(order, -(-len(order) // self.config.batch_size))
+    def _draw(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[Parts]:
+        """Return this process's parts of each batch of a round.
 
-    def _draw(self, demonstrations: Demonstrations, rng: np.random.Generator) -> list[npt.NDArray[np.intp]]:
-        """A number of batches, part of each from the newest states if any were aggregated since round 0."""
-        config, size = self.config, len(demonstrations)
+        Without a number of steps every state is in one batch. With one, part of each batch comes from the newest states
+        if any were aggregated since round 0.
+        """
+        config, size, parts = self.config, len(demonstrations), 1 if self._halves is None else 2
+        if config.updates_per_epoch is None:
+            order = rng.permutation(size)
+            batches = np.array_split(order, -(-size // config.batch_size))
+            return [self._divide(batch, parts) for batch in batches]
         aggregated = config.dagger_every > 0 and len(self.history) >= config.dagger_every
         newest = max(size - config.fresh_window, 0) if aggregated else 0
-        fresh = round(config.fresh_share * config.batch_size)
-        first = np.repeat([newest, 0], [fresh, config.batch_size - fresh])
-        return list(rng.integers(first, size, (config.updates_per_epoch or 0, config.batch_size)))
+        if config.batch_robots is None:
+            fresh = round(config.fresh_share * config.batch_size)
+            first = np.repeat([newest, 0], [fresh, config.batch_size - fresh])
+            batches = rng.integers(first, size, (config.updates_per_epoch, config.batch_size))
+            return [self._divide(batch, parts) for batch in batches]
+        fill = Filler(np.diff(demonstrations.states.offsets), newest, config.fresh_share, rng)
+        pieces = parts * self.ranks.count
+        drawn = [[fill(config.batch_robots // pieces) for _ in range(pieces)] for _ in range(config.updates_per_epoch)]
+        return [batch[self.ranks.rank :: self.ranks.count] for batch in drawn]
+
+    def _divide(self, batch: npt.NDArray[np.intp], parts: int) -> Parts:
+        """Return this process's share of the states of a batch in parts, or as one if they are few.
+
+        So batch norm always has several robots.
+        """
+        own = batch[self.ranks.rank :: self.ranks.count]
+        return np.array_split(own, parts if len(own) >= 4 else 1)
 
     def _validate(self, row: Round, exam: evaluation.Exam) -> None:
         played = rollout(
-            self.policy,
+            self._player,
             exam.instances,
             task=self.config.task,
             execution=self.config.rollout_execution,
@@ -307,7 +349,7 @@ class Training:
             row.validation_flowtime_increase = result.flowtime_increase.mean
         best = [each for each in self.history if each.validation is not None]
         if all(self._merit(row) > self._merit(each) for each in best):
-            checkpoint.save(self.policy, self.folder / "best.safetensors", training=self.config.to_toml())
+            checkpoint.save(self._player, self.folder / "best.safetensors", training=self.config.to_toml())
 
     @staticmethod
     def _merit(row: Round) -> tuple[float, float]:
@@ -321,6 +363,7 @@ class Training:
         state = {
             "processes": self.ranks.count,
             "policy": self.policy.state_dict(),
+            "averaged": None if self._averaged is None else self._averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "scheduler": self.scheduler.state_dict(),
             "history": [asdict(row) for row in self.history],
@@ -348,6 +391,8 @@ class Training:
         try:
             processes = state["processes"]
             self.policy.load_state_dict(state["policy"])
+            if self._averaged is not None:
+                self._averaged.load_state_dict(state["averaged"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.scheduler.load_state_dict(state["scheduler"])
             self.history = [Round(**row) for row in state["history"]]

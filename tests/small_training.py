@@ -42,6 +42,19 @@ MIXED = replace(
 )
 """Two families of cases of mixed sizes."""
 
+CROWDS = replace(
+    MIXED,
+    aggregation="plans",
+    plan_steps=4,
+    stuck_weight=3.0,
+    batch_robots=24,
+    kept_states=40,
+    optimizer="adamw",
+    clip_norm=1.0,
+    averaging=0.9,
+)
+"""What the recipe for crowds adds."""
+
 
 def arguments_for(config, folder):
     """Write a file of settings next to the run folder; return the command line that asks for it."""

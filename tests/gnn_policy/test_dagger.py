@@ -356,27 +356,35 @@ def test_plans_that_are_aggregated_begin_in_states_that_are_visited(kind, cases,
 
 
 @pytest.mark.parametrize("kind", FAMILIES)
-def test_where_plans_are_aggregated_round_zero_has_whole_plans_from_starts(kind, cases, mixed, policy):
+def test_where_plans_are_aggregated_round_zero_has_the_first_steps_of_plans_from_starts(kind, cases, mixed, policy):
     played = {"alike": cases, "mixed": mixed}[kind]
     config, steps = replace(CONFIG, aggregation="plans", plan_steps=6), 5 * 24 * 2
     demonstrations, unsolved = collected(config, policy, played, 0, steps)
     assert unsolved == 0
-    found, first, begun = visits(demonstrations, played), 0, set()
-    while first < len(found):
-        case, positions, _ = found[first]
-        assert np.array_equal(positions, played.instances[case].starts)
-        plan = plan_paths(played.instances[case], w=config.w, node_limit=config.expert_nodes)
-        block = found[first : first + len(plan) - 1]
-        assert all(i == case for i, *_ in block)
-        assert np.array_equal([here for _, here, _ in block], plan[:-1])
-        assert np.array_equal([after(here, moves) for _, here, moves in block], plan[1:])
-        assert demonstrations.states.times[first : first + len(block)].tolist() == list(range(len(block)))
-        first += len(block)
-        begun.add(case)
+    found, expected = visits(demonstrations, played), Counter()
+    begun = [case for case, *_ in found[: steps // 6]]  # the states come time by time
+    assert demonstrations.states.times.tolist() == sorted(demonstrations.states.times)
     assert (demonstrations.states.times == 0).sum() == steps // 6
-    assert len(begun) > len(played) / 2
+    assert len(set(begun)) > len(played) / 2
+    for case in begun:
+        labels = experts.label_plans([played.instances[case]], steps=6, w=config.w, node_limit=config.expert_nodes)
+        for first, last in pairwise(labels.offsets):
+            here = labels.positions[first:last].astype(np.int32)
+            expected[case, here.tobytes(), labels.actions[first:last].tobytes()] += 1
+    assert expected == Counter((case, here.tobytes(), moves.tobytes()) for case, here, moves in found)
     again, _ = collected(config, policy, played, 0, steps)
     assert_equal(demonstrations, again)
+
+
+def test_plans_begin_more_often_where_a_robot_is_stuck(cases, idle_policy):
+    """In a team that never moves every robot is stuck from the second step on."""
+    shares = {}
+    for weight in (1e-9, 1.0, 1e9):
+        config = replace(CONFIG, aggregation="plans", plan_steps=1, stuck_weight=weight)
+        states = collected(replace(config, plan_steps=config.rollout_length), idle_policy, cases, 1, 240)[0].states
+        begun = states.take(np.arange(240 // config.rollout_length))
+        shares[weight] = np.logical_or.reduceat(begun.stuck(), begun.offsets[:-1]).mean()
+    assert shares[1e-9] < shares[1.0] <= shares[1e9] == 1.0
 
 
 def test_where_no_team_is_stuck_nothing_is_demonstrated(policy):

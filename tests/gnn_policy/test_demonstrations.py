@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnn_policy.cases import Family, make_cases
-from gnn_policy.demonstrations import LEAST, BatchMaker, Demonstrations
+from gnn_policy.demonstrations import BatchMaker, Demonstrations, Filler
 from gnn_policy.imitation import EXPERT_ACTION
 from gnn_policy.network import DecentralizedPolicy, PolicyConfig
 from mapf_env import HISTORY, Bag, Instance, States, parallel_env
@@ -182,28 +182,47 @@ def test_equal_generators_give_equal_batches():
     assert all(torch.equal(one[name], again[name]) for name in one.keys())  # noqa: SIM118
 
 
-@pytest.mark.parametrize("parts", [1, 2, 3])
-def test_batches_made_ahead_are_those_made_in_turn(parts):
+@pytest.mark.parametrize("ahead", [False, True])
+def test_batches_of_several_parts_are_made_in_turn_or_ahead(ahead):
     grids, demonstrations = random_states("mixed")
-    batches = BatchMaker(grids, RICH, augment=True)
-    draws = [np.arange(size) for size in (7, 1, LEAST - 1, LEAST, 20)]
-    ahead = list(batches.prefetched(demonstrations, draws, np.random.default_rng(3), parts))
+    maker = BatchMaker(grids, RICH, augment=True)
+    draws = [np.array_split(np.arange(size), parts) for size, parts in ((7, 1), (1, 1), (20, 3))]
+    made = list(maker.batches(demonstrations, draws, np.random.default_rng(3), ahead=ahead))
     generator = np.random.default_rng(3)
-    assert [len(each) for each in ahead] == [parts, 1, 1, parts, parts]
-    for chosen, pieces in zip(draws, ahead, strict=True):
-        for piece, own in zip(pieces, np.array_split(chosen, len(pieces)), strict=True):
-            expected = batches.batch(demonstrations, own, generator)
+    for parts, pieces in zip(draws, made, strict=True):
+        for chosen, piece in zip(parts, pieces, strict=True):
+            expected = maker.batch(demonstrations, chosen, generator)
             assert all(torch.equal(piece[name], expected[name]) for name in expected.keys())  # noqa: SIM118
-    assert list(batches.prefetched(demonstrations, [], generator)) == []
+    assert list(maker.batches(demonstrations, [], generator, ahead=ahead)) == []
 
 
 def test_an_error_while_batches_are_made_ahead_is_raised():
     grids, demonstrations = random_states()
     batches = BatchMaker(grids, PERCEIVED, augment=False)
-    made = batches.prefetched(demonstrations, [np.arange(3), np.array([99])], np.random.default_rng(0))
+    draws = [[np.arange(3)], [np.array([99])]]
+    made = batches.batches(demonstrations, draws, np.random.default_rng(0), ahead=True)
     assert len(next(made)) == 1
     with pytest.raises(IndexError):
         next(made)
+
+
+def test_batches_are_filled_to_the_robot():
+    rng = np.random.default_rng(0)
+    sizes = rng.integers(8, 65, 500)
+    fill = Filler(sizes, newest=400, fresh_share=0.75, rng=rng)
+    drawn = [fill(512) for _ in range(200)]
+    assert all(sizes[chosen].sum() == 512 for chosen in drawn)
+    fresh = np.concatenate([chosen[:-1] >= 400 for chosen in drawn]).mean()
+    assert abs(fresh - (0.75 + 0.25 / 5)) < 0.03  # a draw among all states is a new one at times
+    assert len(np.unique(np.concatenate(drawn))) > 300
+
+
+@pytest.mark.parametrize(("sizes", "robots", "filled"), [([10, 10], 64, 60), ([7], 7, 7), ([50, 40], 30, 40)])
+def test_batches_that_no_teams_fill_are_close_to_it(sizes, robots, filled):
+    fill = Filler(np.array(sizes), newest=0, fresh_share=0.5, rng=np.random.default_rng(1))
+    totals = {int(np.array(sizes)[fill(robots)].sum()) for _ in range(50)}
+    assert filled in totals
+    assert all(total in (filled, max(sizes)) for total in totals)
 
 
 def assert_equal(one, other):

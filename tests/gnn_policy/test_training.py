@@ -25,7 +25,7 @@ from gnn_policy.progress import TrainingProgress
 from gnn_policy.run_folder import open_run
 from gnn_policy.training import Training
 from own_layers import Deaf
-from small_training import CONFIG, MIXED, arguments_for
+from small_training import CONFIG, CROWDS, MIXED, arguments_for
 
 
 class Silence(TrainingProgress):
@@ -239,9 +239,9 @@ def batches_seen(monkeypatch, config, folder):
     seen = []
 
     class Watched(BatchMaker):
-        def prefetched(self, demonstrations, draws, rng, parts=1):
-            seen.extend((len(demonstrations), chosen) for chosen in draws)
-            return super().prefetched(demonstrations, draws, rng, parts)
+        def batches(self, demonstrations, draws, rng, *, ahead):
+            seen.extend((len(demonstrations), np.concatenate(parts)) for parts in draws)
+            return super().batches(demonstrations, draws, rng, ahead=ahead)
 
     monkeypatch.setattr(training, "BatchMaker", Watched)
     run = trained(config, folder)
@@ -467,7 +467,7 @@ def tensorboard_rounds(folder, name):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by POSIX signals")
-@pytest.mark.parametrize("config", [CONFIG, MIXED], ids=["one family", "mixed families"])
+@pytest.mark.parametrize("config", [CONFIG, CROWDS], ids=["one family", "mixed families"])
 def test_a_run_that_is_killed_again_and_again_ends_like_one_that_is_not(tmp_path, config):
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["gnn_policy.train", "gnn_policy.training"])
