@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -77,4 +78,7 @@ def join_ranks() -> Iterator[Ranks]:
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         yield Ranks(distributed.get_rank(), distributed.get_world_size(), local)
     finally:
+        # A thread of the group that outlives it may ask for Python while the process ends, which aborts the process:
+        # the group ends its threads only when nothing refers to it any more.
+        gc.collect()
         distributed.destroy_process_group()

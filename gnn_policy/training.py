@@ -167,6 +167,7 @@ class Training:
             if self._halves is not None:
                 self._halves.close()
             torch.set_num_threads(self.threads)  # and give back more than they took
+            self.loss = ImitationLoss(self.policy)  # which holds on to no group of processes
             if writer is not None:
                 writer.close()
                 self._lock.release()

@@ -40,6 +40,9 @@ class Progress(TrainingProgress):
 with join_ranks() as ranks:
     run = training.Training(config, folder, Progress(config.epochs, Console(quiet=True)), ranks)
     run.run()
+tasks = Path("/proc/self/task")
+threads = sorted(each.joinpath("comm").read_text() for each in tasks.iterdir()) if tasks.exists() else []
+(folder.parent / f"{folder.name}-{ranks.rank}-threads").write_text("".join(threads))
 """
 
 
@@ -75,6 +78,13 @@ def test_both_processes_hold_the_same_policy_and_data_after_every_round(whole):
     for number in range(CONFIG.epochs):
         assert_equal(report(whole, "whole", 0, number), report(whole, "whole", 1, number))
     assert not torch.equal(report(whole, "whole", 0, 0)["head.weight"], report(whole, "whole", 0, 2)["head.weight"])
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_the_threads_of_the_group_end_with_it(whole):
+    """One that is left may ask for Python while the process ends, which aborts the process."""
+    for rank in range(2):
+        assert "gloo" not in (whole / f"whole-{rank}-threads").read_text()
 
 
 def test_a_round_has_as_many_states_as_that_of_one_process_and_its_halves_differ(whole):
