@@ -19,9 +19,10 @@ constexpr int none = -1;
 constexpr std::size_t few_expansions = 32;         // before other means are tried, for w > 1
 constexpr std::size_t few_expansions_optimal = 8;  // and for w = 1
 constexpr int few_conflicts = 20;                  // with more of them in the root, other means are tried at once
-constexpr int many_conflicts = 60;                  // with more of them the root is not untangled
-constexpr int first_effort = 64;                  // rounds and nodes of the first turn
-constexpr std::size_t expansions_of_lacam = 64;   // for each of these
+constexpr int many_conflicts = 60;                 // with more of them the root is not untangled
+constexpr int first_effort = 64;                   // rounds and nodes of the first turn; later turns have twice as many
+constexpr std::size_t first_lacam_turn = 4096;     // expansions of LaCAM's first turn
+constexpr std::size_t lacam_growth = 8;            // the next turn has so many times more
 
 }  // namespace
 
@@ -109,7 +110,8 @@ Status Ecbs::solve_hard_case(int id, const EcbsOptions& options, Budget& budget)
     const auto nodes_left = [&] {
         return options.node_limit - std::min(options.node_limit, nodes_.size() + (proves_ ? proving.generated() : 0));
     };
-    for (int effort = first_effort;; effort += effort) {
+    auto lacam_turn = first_lacam_turn;
+    for (int effort = first_effort;; effort += effort, lacam_turn *= lacam_growth) {
         std::int64_t known = std::numeric_limits<std::int64_t>::max();
         if (!needs_optimum) {
             // Repair: the plan of the neighbourhoods loses its conflicts, then costs.
@@ -117,8 +119,7 @@ Status Ecbs::solve_hard_case(int id, const EcbsOptions& options, Budget& budget)
             if (neighbourhoods.run(target, effort, budget))
                 return finish(hard_->plan_of_neighbourhoods, neighbourhoods.cost());
             // Complete search: LaCAM's plan is the incumbent if it is the cheapest so far.
-            const auto more = hard_->lacam_expansions() + static_cast<std::size_t>(effort) * expansions_of_lacam;
-            if (const auto ended = ask_lacam(more, options, budget)) return *ended;
+            if (const auto ended = ask_lacam(hard_->lacam_expansions() + lacam_turn, options, budget)) return *ended;
             if (neighbourhoods.feasible()) known = neighbourhoods.cost();
         }
         // Proof: the bound rises. The larger w is, the less that helps.
