@@ -1,8 +1,10 @@
 """Solvers in crowds: `python benchmarks/crowds.py COMMAND`.
 
-`table`: first plans, improved plans and bounded plans of dense cases. `labels`: states labelled a second. `plot`:
-success and cost against time. One thread, except for `labels`. POGEMA's maps are read from `FOLDER/NAME/maps.yaml`;
-without the folder its rows are left out. For lifelong play, see `pogema.py --lifelong --methods rolling`.
+`table`: first plans, improved plans and bounded plans of dense cases; `solve` solves a case only if it proves its plan.
+`limits`: plans that it returns without a proof, too. `labels`: states labelled a second. `plot`: success and cost
+against time. One thread, except for `labels`.
+POGEMA's maps are read from `FOLDER/NAME/maps.yaml`; without the folder its rows are left out. For lifelong play, see
+`pogema.py --lifelong --methods rolling`.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ def main() -> None:
     shared.add_argument("--rows", nargs="+", help="rows whose names begin with one of these words (default: all)")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for run in (table, labels, plot):
+    for run in (table, limits, labels, plot):
         summary = (run.__doc__ or "").splitlines()[0]
         command = commands.add_parser(run.__name__, help=summary, description=summary, parents=[shared])
         command.set_defaults(run=run)
@@ -64,6 +66,21 @@ def table(options: argparse.Namespace, console: Console) -> None:
     for name, instances in chosen(options, dense_cases(options.pogema, options.cases)).items():
         for solver_name, solver in solvers.items():
             printed.add_row(name, solver_name, *summary(*timed(solver, instances)))
+    console.print(printed)
+
+
+def limits(options: argparse.Namespace, console: Console) -> None:
+    """Plans that `solve` proves within the time limit, and those that it returns without a proof."""
+    printed = Table(
+        "case", "w", "proved", "with a plan", "median cost / bound", title=f"limits, {options.time_limit:g} s"
+    )
+    for name, instances in chosen(options, dense_cases(options.pogema, options.cases)).items():
+        for w in (1.5, 2):
+            results, _ = timed(partial(experts.solve, w=w, time_limit=options.time_limit), instances)
+            ratios = [result.cost / lower_bound(result) for result in results if result.cost is not None]
+            shares = (sum(result.solved for result in results) / len(results), len(ratios) / len(results))
+            median = f"{np.median(ratios):.3f}" if ratios else ""
+            printed.add_row(name, f"{w:g}", *(f"{share:.3f}" for share in shares), median)
     console.print(printed)
 
 
@@ -116,7 +133,7 @@ def plot(options: argparse.Namespace, console: Console) -> None:
             for marker, (name, solver) in zip("sv^o*P", solvers.items(), strict=True):
                 results, milliseconds = timed(solver, instances)
                 printed.add_row(family, str(num_agents), name, *summary(results, milliseconds))
-                solved = [result for result in results if result.cost is not None]
+                solved = [result for result in results if result.solved]
                 share = len(solved) / len(results)
                 ratio = sum(result.cost or 0 for result in solved) / max(sum(map(lower_bound, solved)), 1)
                 x, y = ([np.median(milliseconds)], [ratio]) if solved else ([], [])
@@ -191,7 +208,7 @@ def chosen(options: argparse.Namespace, cases: Cases) -> Cases:
 
 def summary(results: list[Result], milliseconds: list[float]) -> tuple[str, ...]:
     """Share solved, median and greatest time, mean cost and cost over bound of the solved cases."""
-    costs = [result.cost for result in results if result.cost is not None]
+    costs = [result.cost for result in results if result.solved and result.cost is not None]
     bounds = [lower_bound(result) for result in results if result.solved]
     times = (f"{np.median(milliseconds):.2f}", f"{max(milliseconds):.1f}")
     share = f"{len(costs) / len(results):.3f}"

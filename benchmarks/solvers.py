@@ -214,7 +214,7 @@ def quality_table(title: str) -> Table:
 
 
 def quality(results: list[Result], milliseconds: list[float]) -> tuple[str, ...]:
-    solved = [result for result in results if result.solution is not None]
+    solved = [result for result in results if result.solved]
     share = f"{len(solved) / len(results):.3f}"
     if not solved:
         return (*spread(milliseconds), share, "", "", "")
@@ -233,11 +233,11 @@ def visited_states(instance: Instance, num_states: int, rng: np.random.Generator
     """Joint states (B, N, 2) of a team that follows the expert but idles at random."""
     states = [instance.starts]
     while len(states) < num_states:
-        plan = experts.solve(instance.at(states[-1]), w=1.2).solution
-        if plan is None or len(plan.paths) == 1:
+        result = experts.solve(instance.at(states[-1]), w=1.2)
+        if result.solution is None or not result.solved or len(result.solution.paths) == 1:
             states.append(instance.starts)
             continue
-        for joint in plan.paths[1 : 1 + rng.integers(1, 4)]:
+        for joint in result.solution.paths[1 : 1 + rng.integers(1, 4)]:
             states.append(stumble(states[-1], joint, rng))
     return np.stack(states[:num_states])
 

@@ -16,7 +16,8 @@ from mapf_env import Instance, animate
 from mapf_env.files import require_outputs
 from mapf_env.problem_file import load_problem
 
-_EXIT_CODES = """exit status: 0 solved or valid, 1 not solved or invalid, 2 an error in the arguments or a file"""
+_EXIT_CODES = """exit status: 0 solved or valid, 1 not solved (even with a plan, if it is not proved) or invalid, 2 an
+error in the arguments or a file"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -63,7 +64,8 @@ def _parser() -> _Parser:
         "solve",
         help="solve an instance",
         description="Solve the first robots of a MovingAI scenario or of an instance of a set, or robots placed at "
-        "random on a map, and print cost, bound and time.",
+        "random on a map, and print cost, bound and time. At a limit, ecbs gives the cheapest plan it has found and "
+        "says that it is not proved.",
         epilog=_EXIT_CODES,
     )
     _add_problem(solve, "problem")
@@ -139,6 +141,8 @@ def _solve(options: argparse.Namespace) -> int:
     )
     result = solver(instance)
     print(f"status       {result.status}")
+    if result.solution is not None and not result.solved:
+        print("proof        none, the cost is above w times the lower bound")
     if result.solution is not None:
         print(f"cost         {result.cost}")
     print(f"lower bound  {result.lower_bound}")
@@ -156,7 +160,7 @@ def _solve(options: argparse.Namespace) -> int:
     if options.animation is not None:
         title = f"{options.solver}, {instance.num_agents} robots, cost {result.cost}"
         animate(instance, result.solution, options.animation, title=title)
-    return 0
+    return 0 if result.solved else 1
 
 
 def _check(options: argparse.Namespace) -> int:

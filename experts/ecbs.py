@@ -34,7 +34,9 @@ def solve(
         seed: Shuffles the order in which the first joint plan treats the robots.
 
     Returns:
-        The result. It depends on the arguments only, except that time may run out sooner or later.
+        The result. A search that ends at a limit returns the cheapest plan it has found, if any, with that limit as its
+        status; such a plan costs more than `w` times the lower bound. The result depends on the arguments only, except
+        that time may run out sooner or later.
 
     Raises:
         ValueError: If an argument is out of its range.

@@ -56,7 +56,7 @@ def solve_many(
             threads better the more it is given at once, after every 64 or so.
 
     Returns:
-        One result for each instance, in their order; unsolved ones say why.
+        One result for each instance, in their order; unsolved ones say why, and may hold a plan without a proof.
 
     Raises:
         ValueError: If an argument is out of its range, the solver has no `w` and one is given, or a solver of your own
@@ -111,7 +111,7 @@ def solve_stream(
         progress: As in `solve_many`.
 
     Returns:
-        An iterator over one result for each instance, in their order; unsolved ones say why.
+        An iterator over one result for each instance, in their order, as `solve_many` returns them.
 
     Raises:
         ValueError: As `solve_many`.
@@ -149,7 +149,7 @@ def audited(solver: Solver) -> Solver:
 
     Returns:
         The same solver. It raises a TypeError if the answer is not a `Result`, and a ValueError if its paths do not
-        solve the instance; the message names the solver and what is wrong first.
+        solve the instance, whatever the status; the message names the solver and what is wrong first.
 
     Raises:
         TypeError: If `solver` cannot be called.

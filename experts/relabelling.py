@@ -41,7 +41,8 @@ def relabel(
 
     Returns:
         `actions` (B, N) int8, or (R,) with `offsets`, the `Action` of each robot, and `solved` (B,) bool. Where a state
-        is not solved within the limit, all its actions are IDLE; leave it out of the training data.
+        is not solved within the limit, all its actions are IDLE, even if `solve` returns a plan without a proof; leave
+        it out of the training data.
 
     Raises:
         ValueError: If an argument is out of its range, shapes do not fit, or a state is invalid (off the map, on an

@@ -1,4 +1,4 @@
-"""What a solver answers: a solution with its proof of quality, or the reason why there is none."""
+"""What a solver answers: a solution with its proof of quality, or the reason why there is none or it is not proved."""
 
 from __future__ import annotations
 
@@ -45,9 +45,14 @@ class FoundBy(StrEnum):
 class Result:
     """The outcome of one search.
 
+    A solved result always has a solution, and that of `solve` is proved: `cost <= w * lower_bound`. A search that ends
+    at its node or time limit may have one, too: the cheapest plan that it found. It has no conflicts, but it is not
+    proved to be within `w` of the optimum: `cost > w * lower_bound`. Results with another status have none. So ask
+    `solved` for a proof, and `solution is not None` for a plan.
+
     Attributes:
         status: How the search ended; `infeasible` is a proof that there is no solution.
-        solution: The paths if solved, else None.
+        solution: The paths, or None if there is no plan.
         cost: The sum of costs of the solution in steps, or None without one.
         lower_bound: No solution costs less; proved by the search as far as it got.
         expansions: High-level nodes expanded (PIBT: joint steps; prioritised planning: orders tried).
@@ -74,9 +79,12 @@ class Result:
         arguments.instance_of(self.status, Status, "status")
         if self.solution is not None:
             arguments.instance_of(self.solution, Solution, "solution")
-        if (self.solution is None) == (self.status is Status.SOLVED):
-            given = "none" if self.solution is None else "one"
-            raise ValueError(f"a result has a solution exactly if its status is solved, got {self.status} with {given}")
+        if self.solution is None and self.status is Status.SOLVED:
+            raise ValueError("a solved result needs a solution, got none")
+        if self.solution is not None and self.status not in _WITH_SOLUTION:
+            raise ValueError(
+                f"a result has a solution only if its status is {', '.join(_WITH_SOLUTION)}, got {self.status} with one"
+            )
         paid = None if self.solution is None else self.solution.sum_of_costs
         if self.cost != paid:
             raise ValueError(f"the cost must be the solution's sum of costs, {paid}, got {self.cost!r}")
@@ -101,10 +109,11 @@ class Result:
 
     @property
     def solved(self) -> bool:
-        """Whether there is a solution."""
-        return self.solution is not None
+        """True if the status is `solved`: for `solve`, the cost is proved to be within `w` times the optimum."""
+        return self.status is Status.SOLVED
 
 
+_WITH_SOLUTION = (Status.SOLVED, Status.NODE_LIMIT, Status.TIME_LIMIT)
 _STATUSES = tuple(Status)  # the native enumeration has the same order
 FINDERS = (None, *FoundBy)
 """The parts that find plans, in the order of the native enumeration."""

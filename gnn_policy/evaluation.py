@@ -71,7 +71,8 @@ class Exam:
     ) -> Exam:
         """Solve the cases by the expert; T_max is `timeout` times the makespan of its solution.
 
-        LaCAM plans the cases that ECBS leaves. The cases that are solved depend on `nodes`, not on the machine.
+        LaCAM plans the cases that ECBS leaves, also where ECBS has a plan without a proof. The cases that are solved
+        depend on `nodes`, not on the machine.
 
         Args:
             instances: The cases.
@@ -93,7 +94,7 @@ class Exam:
         known = [i for i, result in enumerate(results) if result.solved]
         if not known:
             raise ValueError(f"the expert solved none of the {len(instances)} cases: make them easier or raise w")
-        solutions = [result.solution for result in results if result.solution is not None]
+        solutions = [plan for i in known if (plan := results[i].solution) is not None]
         return Exam(
             [instances[i] for i in known],
             solutions,

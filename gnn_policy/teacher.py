@@ -81,7 +81,10 @@ class Teacher:
         return moves, solved
 
     def plans(self, states: States) -> list[Solution | None]:
-        """Return the plan from each of T states, or None where the expert found none."""
+        """Return the plan from each of T states, or None where the expert did not solve it.
+
+        Plans without a proof are left out, too: `w` sets how good the labels are.
+        """
         if not len(states):
             return []
         began = self._clock()
@@ -97,7 +100,8 @@ class Teacher:
         plans: list[Solution | None] = []
         for first, last, result in zip(states.offsets[:-1], states.offsets[1:], results, strict=True):
             back = (order[first:last] - first).argsort()
-            plans.append(None if result.solution is None else Solution(result.solution.paths[:, back]))
+            plan = result.solution if result.solved else None
+            plans.append(None if plan is None else Solution(plan.paths[:, back]))
         self.seconds += self._clock() - began
         return plans
 

@@ -71,7 +71,7 @@ void run_without_gil(const Search& search) {
 
 struct Outcome {
     mapf::Status status = mapf::Status::time_limit;
-    std::vector<std::int32_t> paths;  // (T + 1, N, 2), empty unless solved
+    std::vector<std::int32_t> paths;  // (T + 1, N, 2), empty without a plan
     std::int64_t cost = 0, lower_bound = 0;
     std::size_t expansions = 0, generated = 0;
     double seconds = 0;
@@ -134,7 +134,7 @@ Outcome run_ecbs(const InstanceArrays& arrays, const mapf::EcbsOptions& options,
         outcome.lower_bound = ecbs.lower_bound();
         outcome.expansions = ecbs.expansions();
         outcome.generated = ecbs.generated();
-        if (outcome.status == mapf::Status::solved) {
+        if (ecbs.has_plan()) {
             write_plan(grid.layout, starts, ecbs, outcome);
             outcome.found_by = ecbs.found_by();
         }

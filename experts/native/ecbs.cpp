@@ -31,14 +31,20 @@ Status Ecbs::solve(const Problem& problem, const EcbsOptions& options, Budget& b
     num_robots_ = problem.starts.size();
     expansions_ = 0;
     cost_ = lower_bound_ = 0;
-    found_by_ = FoundBy::ecbs;
-    proves_ = false;
+    found_by_ = FoundBy::none;
+    best_node_ = none;
+    repairs_ = proves_ = false;
     if (hard_) hard_->lacam.reset();
     nodes_.clear();
     paths_.clear();
     actions_.clear();
     for (std::size_t robot = 0; robot < num_robots_; ++robot)
         lower_bound_ += problem.distances.to_goal_of(robot)[problem.starts[robot]];
+    const auto status = search(options, budget);
+    return status == Status::node_limit || status == Status::time_limit ? end_at(status, options.w) : status;
+}
+
+Status Ecbs::search(const EcbsOptions& options, Budget& budget) {
     if (!plan_root(options.w, options.seed, budget)) return Status::time_limit;
     const auto patience = options.w <= 1                         ? few_expansions_optimal
                           : nodes_[0].conflicts > few_conflicts ? 1
@@ -51,8 +57,7 @@ Status Ecbs::solve(const Problem& problem, const EcbsOptions& options, Budget& b
         const int id = open_.pop();
         if (nodes_[id].conflicts == 0) {
             load(id);
-            cost_ = nodes_[id].cost;
-            return Status::solved;
+            return finish(FoundBy::ecbs, nodes_[id].cost);
         }
         if (expansions_ == patience || nodes_.size() >= options.node_limit)
             return options.hard_cases ? solve_hard_case(id, options, budget) : Status::node_limit;
@@ -106,6 +111,7 @@ Status Ecbs::solve_hard_case(int id, const EcbsOptions& options, Budget& budget)
         load(id);
         neighbourhoods.begin(*problem_, options.seed, path_of);
         hard_->plan_of_neighbourhoods = FoundBy::repair;
+        repairs_ = true;
     }
     const auto nodes_left = [&] {
         return options.node_limit - std::min(options.node_limit, nodes_.size() + (proves_ ? proving.generated() : 0));
@@ -175,6 +181,23 @@ Status Ecbs::finish(FoundBy author, std::int64_t cost) {
     return Status::solved;
 }
 
+// Ends with the cheapest plan of all searches, if there is one. It can be within the bound after all: limits may cut a
+// search off between the last plan or bound and the next comparison of the two.
+Status Ecbs::end_at(Status limit, double w) {
+    auto best = std::numeric_limits<std::int64_t>::max();
+    const auto consider = [&](FoundBy author, std::int64_t cost) {
+        if (cost >= best) return;
+        best = cost;
+        finish(author, cost);
+    };
+    if (best_node_ != none) consider(FoundBy::ecbs, nodes_[best_node_].cost);
+    if (repairs_ && hard_->neighbourhoods.feasible())
+        consider(hard_->plan_of_neighbourhoods, hard_->neighbourhoods.cost());
+    if (proves_ && hard_->proving.has_plan()) consider(FoundBy::proof, hard_->proving.cost());
+    if (found_by_ == FoundBy::ecbs) load(best_node_);
+    return has_plan() && best <= cost_limit(w, lower_bound_) ? Status::solved : limit;
+}
+
 // Plans each robot in conflict anew, now that it can see the paths of all; no path becomes longer.
 bool Ecbs::untangle(Node& root, Budget& budget) {
     for (const int robot : order_) {
@@ -214,6 +237,7 @@ void Ecbs::expand(int id, Budget& budget) {
 void Ecbs::open(const Node& node) {
     const int id = static_cast<int>(nodes_.size());
     nodes_.push_back(node);
+    if (node.conflicts == 0 && (best_node_ == none || node.cost < nodes_[best_node_].cost)) best_node_ = id;
     open_.push(id, node.cost, node.conflicts);
 }
 

@@ -36,9 +36,11 @@ struct EcbsOptions {
 // bound.
 class Ecbs {
 public:
+    // A search that ends at a limit keeps its incumbent, the cheapest plan that it found, whose cost is above w times the
+    // lower bound then: has_plan() holds for it, too.
     Status solve(const Problem& problem, const EcbsOptions& options, Budget& budget);
 
-    // Of the last search. Each robot's actions until it arrives, if it was solved.
+    // Of the last search. Each robot's actions until it arrives, if there is a plan.
     std::span<const std::uint8_t> actions(std::size_t robot) const {
         switch (found_by_) {
             case FoundBy::proof: return hard_->proving.actions(robot);
@@ -47,6 +49,7 @@ public:
             default: return hard_->neighbourhoods.actions(robot);
         }
     }
+    bool has_plan() const { return found_by_ != FoundBy::none; }
     FoundBy found_by() const { return found_by_; }
     int cost() const { return cost_; }
     int lower_bound() const { return lower_bound_; }
@@ -90,11 +93,13 @@ private:
         std::size_t lacam_expansions() const { return lacam ? lacam->expansions() : 0; }
     };
 
+    Status search(const EcbsOptions& options, Budget& budget);
     bool plan_root(double w, std::uint64_t seed, Budget& budget);
     bool untangle(Node& root, Budget& budget);
     Status solve_hard_case(int id, const EcbsOptions& options, Budget& budget);
     std::optional<Status> ask_lacam(std::size_t expansions, const EcbsOptions& options, Budget& budget);
     Status finish(FoundBy author, std::int64_t cost);
+    Status end_at(Status limit, double w);
     Journey journey(int robot, int earliest) const;
     void expand(int id, Budget& budget);
     void load(int id);
@@ -113,8 +118,10 @@ private:
     OpenList open_;
     SpaceTimeSearch search_;
     std::unique_ptr<HardCases> hard_;  // made for the first hard case
-    FoundBy found_by_ = FoundBy::ecbs;
-    bool proves_ = false;  // whether the proving search is of this problem
+    FoundBy found_by_ = FoundBy::none;
+    int best_node_ = -1;    // the cheapest node without conflicts
+    bool repairs_ = false;  // whether the neighbourhood search is of this problem
+    bool proves_ = false;   // whether the proving search is
     Traffic traffic_;
     std::vector<int> loaded_;  // the path of each robot that is in the traffic now
     std::vector<int> root_paths_, wanted_, order_;

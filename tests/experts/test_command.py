@@ -104,6 +104,29 @@ def test_no_plan_is_status_1(scen: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "infeasible" in capsys.readouterr().out
 
 
+def test_a_plan_without_a_proof_is_printed_and_written_with_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem, paths, picture = (str(tmp_path / name) for name in ("crowd.json", "paths.txt", "plan.svg"))
+    crowd = random_instance(num_agents=30, density=0.3, seed=0)
+    save_instances(problem, [crowd])
+    limited = ["--w", "1.01", "--node-limit", "50", "--paths", paths, "--animation", picture]
+    assert main(["solve", problem, *limited]) == 1
+    printed = capsys.readouterr().out
+    result = experts.solve(crowd, w=1.01, node_limit=50)
+    assert printed.splitlines()[:4] == [
+        "status       node_limit",
+        "proof        none, the cost is above w times the lower bound",
+        f"cost         {result.cost}",
+        f"lower bound  {result.lower_bound}",
+    ]
+    assert experts.load_paths(paths).sum_of_costs == result.cost
+    assert Path(picture).read_text().startswith("<svg")
+    assert main(["check", paths, "--scen", problem]) == 0
+    assert main(["solve", problem]) == 0
+    assert "proof" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

@@ -27,6 +27,16 @@ def require_solution(instance: Instance, result: Result) -> None:
     assert result.lower_bound <= result.solution.sum_of_costs
 
 
+def require_plan_without_proof(instance: Instance, result: Result, w: float, limit: Status) -> None:
+    assert result.status is limit
+    assert not result.solved
+    assert result.solution is not None
+    paths = result.solution.paths
+    assert plan_oracles.faults(instance.grid, instance.starts, instance.goals, paths) == []
+    assert result.cost == plan_oracles.sum_of_costs(paths) > w * result.lower_bound
+    assert result.found_by is not None
+
+
 def outcome(result: Result) -> tuple[object, ...]:
     paths = None if result.solution is None else result.solution.paths.tolist()
     return result.status, paths, result.cost, result.lower_bound, result.expansions, result.generated
@@ -61,7 +71,7 @@ def test_bounds_hold(instance: Instance, w: float, seed: int) -> None:
     optimum = plan_oracles.optimal_cost(instance.grid, instance.starts, instance.goals)
     result = experts.solve(instance, w=w, seed=seed, node_limit=5_000)
     if optimum is None:
-        assert not result.solved
+        assert result.solution is None
         return
     assert result.lower_bound <= optimum
     if result.solved:
@@ -166,7 +176,63 @@ def test_what_lacam_solves_within_the_bound_never_ends_at_the_node_limit(instanc
     result, lacam = experts.solve(instance, w=w, node_limit=200), experts.lacam(instance, node_limit=200)
     if not result.solved and lacam.cost is not None:
         assert lacam.cost > w * result.lower_bound
-    assert (result.found_by is None) == (not result.solved)
+    if lacam.solved:
+        assert result.solution is not None
+    assert (result.found_by is None) == (result.solution is None)
+
+
+@small
+@given(
+    strategies.instances(max_side=5, min_agents=2, max_agents=8),
+    FACTORS,
+    st.integers(1, 40),
+    st.integers(0, 2**64 - 1),
+)
+def test_a_plan_at_the_node_limit_has_no_conflicts_and_costs_more_than_the_bound(
+    instance: Instance, w: float, node_limit: int, seed: int
+) -> None:
+    result = experts.solve(instance, w=w, node_limit=node_limit, seed=seed)
+    if result.solved:
+        require_solution(instance, result)
+        assert result.cost is not None
+        assert result.cost <= w * result.lower_bound
+    elif result.solution is not None:
+        require_plan_without_proof(instance, result, w, Status.NODE_LIMIT)
+    else:
+        assert (result.cost, result.found_by) == (None, None)
+    assert outcome(result) == outcome(experts.solve(instance, w=w, node_limit=node_limit, seed=seed))
+
+
+def test_every_search_can_find_the_plan_without_a_proof() -> None:
+    instances = [
+        random_instance(height=4 + seed % 3, width=4 + seed % 2, density=0.15, num_agents=3 + seed % 6, seed=seed)
+        for seed in range(120)
+    ]
+    found = set()
+    for w in (1.0, 1.05):
+        for node_limit in (5, 30, 200):
+            for instance, result in zip(
+                instances, experts.solve_many(instances, w=w, node_limit=node_limit), strict=True
+            ):
+                if result.solution is not None and not result.solved:
+                    require_plan_without_proof(instance, result, w, Status.NODE_LIMIT)
+                    found.add(result.found_by)
+    assert found == {FoundBy.ECBS, FoundBy.REPAIR, FoundBy.PROOF, FoundBy.IMPROVEMENT}
+
+
+def test_crowds_that_cannot_be_proved_have_a_plan() -> None:
+    crowds = [random_instance(height=21, width=21, num_agents=64, style=Maze(), seed=seed) for seed in (0, 5)]
+    results = experts.solve_many(crowds, w=2, node_limit=300, time_limit=math.inf)
+    for crowd, result in zip(crowds, results, strict=True):
+        require_plan_without_proof(crowd, result, 2, Status.NODE_LIMIT)
+    again = experts.solve_many(crowds, w=2, node_limit=300, time_limit=math.inf, threads=2)
+    assert [outcome(result) for result in again] == [outcome(result) for result in results]
+
+
+def test_the_plan_is_there_when_time_is_up() -> None:
+    crowd = random_instance(num_agents=40, density=0.3, seed=0)
+    result = experts.solve(crowd, w=1.01, time_limit=1)  # the first plan takes milliseconds, the proof minutes
+    require_plan_without_proof(crowd, result, 1.01, Status.TIME_LIMIT)
 
 
 @pytest.mark.parametrize("num_agents", [32, 64])

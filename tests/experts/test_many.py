@@ -185,8 +185,12 @@ def test_results_that_contradict_themselves_cannot_be_built() -> None:
     for changes, said in (
         ({"cost": 0}, "cost must be the solution's sum of costs, 1, got 0"),
         ({"cost": None}, "cost must be .* got None"),
-        ({"solution": None}, "has a solution exactly if its status is solved, got solved with none"),
-        ({"status": Status.INFEASIBLE}, "got infeasible with one"),
+        ({"solution": None}, "a solved result needs a solution, got none"),
+        (
+            {"status": Status.INFEASIBLE},
+            "only if its status is solved, node_limit, time_limit, got infeasible with one",
+        ),
+        ({"status": Status.STEP_LIMIT}, "got step_limit with one"),
         ({"lower_bound": 2}, "lower_bound must be at most 1, got 2"),
         ({"lower_bound": -1}, "lower_bound must be at least 0"),
         ({"seconds": math.nan}, "seconds must not be negative"),
@@ -198,3 +202,18 @@ def test_results_that_contradict_themselves_cannot_be_built() -> None:
         replace(sound, status="solved")
     with pytest.raises(TypeError, match=r"solution must be a mapf_env\.Solution, got ndarray"):
         replace(sound, solution=solution.paths)
+
+
+@pytest.mark.parametrize("status", [Status.NODE_LIMIT, Status.TIME_LIMIT])
+def test_a_plan_without_a_proof_is_not_solved_but_audited(status: Status) -> None:
+    def unproved(instance: Instance) -> Result:
+        plan = experts.lacam(instance).solution
+        return replace(Result.of(plan or Solution(instance.starts[None])), status=status)
+
+    told = []
+    (result,) = experts.solve_many(INSTANCES[:1], solver=unproved, progress=lambda *counts: told.append(counts))
+    assert result.solution is not None
+    assert not result.solved
+    assert told == [(1, 0)]
+    with pytest.raises(ValueError, match="jumps in step 0"):
+        experts.audited(lambda instance: replace(Jumper()(instance), status=status))(INSTANCES[0])

@@ -12,7 +12,7 @@ OPEN = Instance(np.zeros((4, 4), bool), [(0, 0), (3, 3)], [(3, 3), (0, 0)])
 
 def first_actions(instance: Instance, **options: float) -> tuple[list[int], bool]:
     result = experts.solve(instance, **options)  # pyright: ignore[reportArgumentType]
-    if result.solution is None or len(result.solution.paths) == 1:
+    if result.solution is None or not result.solved or len(result.solution.paths) == 1:
         return [Action.IDLE] * instance.num_agents, result.solved
     return result.solution.actions[0].tolist(), True
 

@@ -16,7 +16,7 @@ from gnn_policy.baselines import GreedyActor, RandomActor
 from gnn_policy.cases import Family, make_cases
 from gnn_policy.evaluation import LIFELONG_BASELINES, Estimate, Exam
 from gnn_policy.execution import Execution
-from mapf_env import Instance
+from mapf_env import Instance, random_instance
 
 
 @pytest.mark.parametrize(
@@ -120,6 +120,17 @@ def test_cases_that_the_expert_does_not_solve_are_counted_and_left_out():
     assert exam.unsolved == 1
     assert exam.instances == pairs[1:]
     assert Exam.prepare(cases, w=1.0, timeout=3.0, threads=1).unsolved == 0
+
+
+def test_lacam_plans_the_cases_where_ecbs_has_no_proof():
+    crowd = random_instance(num_agents=30, density=0.3, seed=0)
+    left = experts.solve(crowd, w=1.01, node_limit=500)
+    assert left.solution is not None
+    assert not left.solved
+    exam = Exam.prepare([crowd], w=1.01, timeout=3.0, threads=1, nodes=500)
+    plan = experts.lacam(crowd, node_limit=500).solution
+    assert plan
+    assert np.array_equal(exam.solutions[0].paths, plan.paths)
 
 
 def test_which_cases_the_expert_solves_is_no_matter_of_time(monkeypatch):

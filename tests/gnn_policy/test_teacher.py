@@ -221,6 +221,17 @@ def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
     assert (len(twice), counted) == (2 * len(found), 2 * unsolved)
 
 
+def test_plans_without_a_proof_teach_nothing():
+    crowd = make_cases("train", seed=1, maps=1, cases_per_map=2, families=[Family(num_agents=(40, 40))])
+    results = [experts.solve(case, w=1.02, node_limit=10) for case in crowd.instances]
+    assert any(result.solution is not None and not result.solved for result in results), "the cases do not test this"
+    teacher = taught_by(crowd, w=1.02, node_limit=10)
+    states = states_of(crowd, np.arange(2))
+    expected = [result.solved for result in results]
+    assert [plan is not None for plan in teacher.plans(states)] == expected
+    assert teacher.moves(states)[1].tolist() == expected
+
+
 def test_labels_keep_the_order_of_the_visits_and_each_state_its_history(cases):
     order = [7, 2, 7, 9, 0, 2]
     states = states_of(cases, order)

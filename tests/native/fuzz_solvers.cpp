@@ -125,10 +125,12 @@ int main(int count, char** arguments) {
         const mapf::Problem problem{grid, starts, goals, distances};
         const auto seed = static_cast<std::uint64_t>(round);
         for (const double w : {1.0, 1.05, 1.3}) {
-            if (ecbs.solve(problem, {w, 300, seed}, budget) != mapf::Status::solved) continue;
+            const bool proved = ecbs.solve(problem, {w, 300, seed}, budget) == mapf::Status::solved;
+            require(ecbs.has_plan() || !proved, "ECBS has solved a crowd without a plan", crowd);
+            if (!ecbs.has_plan()) continue;
             ++solved;
             require(is_plan(crowd, [&](std::size_t robot) { return ecbs.actions(robot); }), "no plan by ECBS", crowd);
-            require(ecbs.cost() <= w * ecbs.lower_bound(), "the bound of ECBS does not hold", crowd);
+            require((ecbs.cost() <= w * ecbs.lower_bound()) == proved, "the bound of ECBS does not hold", crowd);
         }
         mapf::Lacam lacam(grid, starts, goals, seed);
         if (lacam.run(mapf::Lacam::limits_of(300), budget) == mapf::Status::solved) {
