@@ -66,15 +66,33 @@ def scores_of(policy: nn.Module, bag: Bag, execution: Execution, noise: Any) -> 
     """Return the scores (M, 5) of the moves of a bag's robots; `noise` is that of `Execution.scores`.
 
     Raises:
-        ValueError: If stuck robots sample, but the bag does not say which are stuck.
+        ValueError: If the bag does not say what the execution reads, such as which robots are stuck.
     """
     config: PolicyConfig = policy.config  # pyright: ignore[reportAssignmentType]
-    alarm = np.zeros(len(bag.team), np.bool_)
-    if execution.sample == "stuck":
-        alarm = bag.scalars[:, _stuck_column(config, bag.scalars.shape[1])] > 0
-        if config.taps > 1:  # with one tap robots do not communicate
-            alarm = alarmed(alarm, bag.edge_index)
-    return execution.scores(logits_of(policy, bag), alarm, noise)
+    facts = facts_of(bag.scalars, config, execution)
+    alarm = facts["stuck"][:, 0] if "stuck" in facts else np.zeros(len(bag.team), np.bool_)
+    if config.taps > 1:  # with one tap robots do not communicate
+        alarm = alarmed(alarm, bag.edge_index)
+    return execution.scores(logits_of(policy, bag), alarm, noise, facts.get("greedy_moves"))
+
+
+def facts_of(
+    scalars: npt.NDArray[np.floating], config: PolicyConfig, execution: Execution
+) -> dict[str, npt.NDArray[np.bool_]]:
+    """Return the robot features (M, width) that the execution reads, by name.
+
+    Raises:
+        ValueError: If they are not among the scalars.
+    """
+    names, known = execution.robot_features(config), robot_features(config.memory)
+    ends = np.cumsum([known[name].width for name in names])
+    if execution.features and ends[-1] > scalars.shape[1]:
+        raise ValueError(
+            f"the execution {execution.name} reads {' and '.join(execution.features)}, which the observation does not "
+            "say: make the environment with **policy.env_settings(), or pass execution=Execution()"
+        )
+    columns = dict(zip(names, np.split(scalars, ends[:-1], axis=1), strict=True)) if execution.features else {}
+    return {name: columns[name][:, : known[name].width] > 0 for name in execution.features}
 
 
 def act(policy: nn.Module, observation: Any, execution: Execution, rng: np.random.Generator) -> Any:
@@ -128,18 +146,6 @@ def _stacked(parts: Any, array: Any) -> Observation:
         array(parts["scalars"]) if "scalars" in parts.keys() else none[:, :, 0],  # noqa: SIM118 (a TensorDict)
         array(parts["edge_attr"]) if "edge_attr" in parts.keys() else none,  # noqa: SIM118
     )
-
-
-def _stuck_column(config: PolicyConfig, width: int) -> int:
-    names = (*config.robot_features, "stuck")  # where a policy does not read it, it comes last
-    known = robot_features(config.memory)
-    column = sum(known[name].width for name in names[: names.index("stuck")])
-    if column >= width:
-        raise ValueError(
-            "robots that are stuck sample, but the observation does not say which are stuck: make the environment with "
-            "**policy.env_settings(), or pass execution=Execution()"
-        )
-    return column
 
 
 def _noise(rng: np.random.Generator, count: int) -> Scores:

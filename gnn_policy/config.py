@@ -131,7 +131,7 @@ class TrainConfig:
     except for what `sample_rollouts` says."""
     sample_rollouts: Sample = False
     """Which moves of rollouts in training and validation are drawn from the softmax: those of no robot, of all robots,
-    or of robots that are "stuck"."""
+    or of robots that are "stuck"; or "fallback", as `Execution.sample` explains."""
     augment: bool = False
     """Turn and reflect every demonstrated state at random."""
 

@@ -16,7 +16,7 @@ from mapf_env.config import Shield
 from mapf_env.hashing import mix
 from mapf_env.senses import CommRange, CommWeights
 
-Sample = Literal[False, True, "stuck"]
+Sample = Literal[False, True, "stuck", "fallback"]
 Seeds = npt.NDArray[np.uint64]
 Flags = npt.NDArray[np.bool_]
 Logits = npt.NDArray[np.float32]
@@ -33,8 +33,10 @@ class Execution:
     """
 
     sample: Sample = False
-    """Draw a robot's move from the softmax in place of the most probable one: never, always, or while it or a neighbour
-    is "stuck": off its goal and back on a cell where it stood in one of its last 16 steps."""
+    """Draw a robot's move from the softmax instead of taking the most probable one: never, always, or while it or a
+    neighbour is "stuck": off its goal and back on a cell where it stood in one of its last 16 steps. "fallback": such
+    robots prefer the moves that shorten their way, then to stay, as PIBT does, and draw among equals. That needs the
+    map, and the shield "pibt_swap" makes the most of it."""
     temperature: float = 1.0
     """Divides the logits where moves are drawn."""
     shield: Shield = "idle"
@@ -61,7 +63,9 @@ class Execution:
                 "for the most probable move: sample=False"
             )
 
-    def scores(self, logits: Logits, alarmed: Flags, noise: Callable[[Flags], Logits]) -> Logits:
+    def scores(
+        self, logits: Logits, alarmed: Flags, noise: Callable[[Flags], Logits], greedy: Flags | None = None
+    ) -> Logits:
         """Return a score for each move; the greatest is taken, and PIBT takes their order.
 
         A robot that draws adds Gumbel noise to its logits over the temperature: the greatest score is then a draw from
@@ -71,16 +75,17 @@ class Execution:
             logits: (M, 5) of robots.
             alarmed: (M,) robots that are stuck or hear a robot that is.
             noise: Returns Gumbel noise (m, 5) for the m robots that a mask (M,) selects.
+            greedy: (M, 5) the moves that shorten each robot's way, which the fallback reads.
 
         Raises:
-            ValueError: If a logit, or a logit over the temperature, is not finite.
+            ValueError: If a logit, or a logit over the temperature, is not finite, or the fallback has no greedy moves.
         """
         if not np.isfinite(logits).all():
             raise ValueError(
                 "the policy's logits are not finite: its weights or what it observes are damaged, or its training "
                 "diverged; train it again with a smaller lr"
             )
-        draws = alarmed if self.sample == "stuck" else np.full_like(alarmed, self.sample)
+        draws = np.full_like(alarmed, self.sample) if isinstance(self.sample, bool) else alarmed
         if not draws.any():
             return logits
         scores = logits.copy()
@@ -88,13 +93,26 @@ class Execution:
             scores[draws] = logits[draws] / self.temperature + noise(draws)
         if not np.isfinite(scores).all():
             raise ValueError(f"the logits over a temperature of {self.temperature} are not finite: give a higher one")
+        if self.sample == "fallback":
+            if greedy is None:
+                raise ValueError("the fallback needs the moves that shorten each robot's way, (M, 5)")
+            tier = 2.0 * greedy[draws]
+            tier[:, Action.IDLE] = np.maximum(tier[:, Action.IDLE], 1.0)
+            scores[draws] = scores[draws].clip(-_TIER / 3, _TIER / 3) + _TIER * tier.astype(np.float32)
         return scores
 
+    @property
+    def features(self) -> tuple[str, ...]:
+        """The robot features that this way of execution reads itself."""
+        return {"stuck": ("stuck",), "fallback": ("greedy_moves", "stuck")}.get(str(self.sample), ())
+
+    def robot_features(self, policy: PolicyConfig) -> tuple[str, ...]:
+        """Return what robots of `policy` know about themselves: what it reads, then what only the execution reads."""
+        return (*policy.robot_features, *(each for each in self.features if each not in policy.robot_features))
+
     def senses(self, policy: PolicyConfig) -> Senses:
-        """Return what robots of `policy` perceive: what it reads, and at the end "stuck" where stuck robots sample."""
-        perceived: dict[str, Any] = policy.senses()
-        if self.sample == "stuck" and "stuck" not in policy.robot_features:
-            perceived["robot_features"] = (*policy.robot_features, "stuck")
+        """Return what robots of `policy` perceive when it is executed so."""
+        perceived: dict[str, Any] = policy.senses() | {"robot_features": self.robot_features(policy)}
         if self.comm_range is not None:
             perceived["comm_range"] = self.comm_range
         if self.comm_weights is not None:
@@ -132,11 +150,15 @@ class Execution:
                 raise ValueError(f"the variant {text!r} says {option} twice: {given[option]} and {value}")
             given[option] = value
         if "temperature" in given and not given.get("sample"):
-            raise ValueError(f"the variant {text!r} has a temperature but draws nothing: say sampled or stuck")
+            raise ValueError(
+                f"the variant {text!r} has a temperature but draws nothing: say sampled, stuck or fallback"
+            )
         return replace(Execution() if base is None else base, **{"sample": False, **given})
 
 
-_WORD_OF_SAMPLE = {False: "argmax", True: "sampled", "stuck": "stuck"}
+_TIER = np.float32(1000.0)
+"""The distance between the scores of moves that shorten a robot's way, of staying, and of other moves."""
+_WORD_OF_SAMPLE = {False: "argmax", True: "sampled", "stuck": "stuck", "fallback": "fallback"}
 _OPTION_OF_WORD = {word: ("sample", sample) for sample, word in _WORD_OF_SAMPLE.items()} | {
     word: (option, word)
     for option, words in (("shield", Shield), ("comm_range", CommRange), ("comm_weights", CommWeights))

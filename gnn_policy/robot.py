@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from gnn_policy.acting import facts_of
 from gnn_policy.execution import Execution, gumbel
 from gnn_policy.finite import require_finite
 from gnn_policy.layers import Links, MessageLayer, State
@@ -95,6 +96,7 @@ class Robot:
         self._state: State = ()
         self._round = -1
         self._stuck = self._alarmed = False
+        self._greedy: npt.NDArray[np.bool_] | None = None
 
     @property
     def rounds(self) -> int:
@@ -122,7 +124,8 @@ class Robot:
             links: The weights of the links to the neighbours that it hears, by whatever names they have: 1, or 1 /
                 distance for a policy whose comm_weights are "distance".
             cell: Row and column of where it stands, in any frame that stays the same, such as its odometry's.
-            scalars: (K,) the robot features that the policy reads.
+            scalars: (K,) the robot features that the policy reads; where stuck robots fall back on their shortest way,
+                those of `Execution.robot_features`.
             edge_attr: (D,) the edge features of each link, by the same names, if the policy reads any.
 
         Raises:
@@ -142,6 +145,8 @@ class Robot:
         own = np.asarray(scalars, np.float32)
         if own.ndim != 1 or not np.isfinite(own).all():
             raise ValueError(f"scalars must be a row of finite numbers, got {own.tolist()}")
+        if self._execution.sample == "fallback":
+            self._greedy = facts_of(own[None], self._policy.config, self._execution)["greedy_moves"]
         with torch.inference_mode():
             extracted = self._policy.extract(self._tensor(view)[None], self._tensor(own)[None])
             if not bool(torch.isfinite(extracted).all()):
@@ -214,7 +219,7 @@ class Robot:
         def noise(drawn: npt.NDArray[np.bool_]) -> Features:
             return gumbel(self._seed, np.array([self._time]))
 
-        return self._execution.scores(self.logits()[None], np.array([self._alarmed]), noise)[0]
+        return self._execution.scores(self.logits()[None], np.array([self._alarmed]), noise, self._greedy)[0]
 
     def act(self) -> int:
         """Return the move that it wants, 0..4, the one with the greatest score; the world's shield has the last word.

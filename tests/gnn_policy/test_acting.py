@@ -12,8 +12,9 @@ import bags
 import strategies
 from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig
 from gnn_policy.acting import bag_of, logits_of
+from gnn_policy.execution import alarmed
 from gnn_policy.team_env import ACTION, POSITIONS, TeamEnv
-from mapf_env import Bag, BatchedEnv, Instance, parallel_env, random_instance
+from mapf_env import MOVES, Action, Bag, BatchedEnv, Instance, distances, parallel_env, random_instance
 
 CASES = [
     random_instance(num_agents=agents, height=height, width=width, density=0.1, seed=agents)
@@ -241,6 +242,27 @@ def test_robots_draw_when_they_are_stuck_or_hear_one_that_is(taps, knows):
     assert (taken[:, still] == by_argmax[still]).all()
 
 
+@pytest.mark.parametrize("own", [(), ("stuck", "on_goal", "greedy_moves")])
+def test_robots_that_are_stuck_or_hear_one_fall_back_on_their_shortest_way(own):
+    execution = Execution(sample="fallback", temperature=0.5, shield="pibt_swap")
+    policy = seeded_policy(execution=execution, robot_features=own, comm_radius=1.5)
+    env, observation = played(policy, steps=1)
+    bag, states = env.bag(), env.states()
+    alarm = alarmed(states.stuck(), bag.edge_index)
+    assert 0 < alarm.sum() < len(alarm)
+    scores = policy.act(observation, seed=3)[env.present]
+    assert np.array_equal(scores[~alarm], of_network(policy, bag)[~alarm])
+    for robot in np.flatnonzero(alarm):
+        case = CASES[states.team[robot]]
+        steps = np.pad(distances(case.grid, states.goals[[robot]])[0], 1, constant_values=-1)
+        around = [steps[tuple(states.positions[robot] + move + 1)] for move in MOVES]
+        here = around[Action.IDLE]
+        shorter = [here == 0 == there or 0 <= there < here for there in around]
+        tiers = np.array([2 * each for each in shorter])
+        tiers[Action.IDLE] = max(tiers[Action.IDLE], 1)
+        assert (np.diff(tiers[scores[robot].argsort()]) >= 0).all()
+
+
 def test_stuck_robots_of_a_dictionary_draw():
     policy = seeded_policy(execution=Execution(sample="stuck", temperature=1e6), comm_radius=0.0)
     instance = Instance(np.zeros((1, 4), bool), [[0, 0], [0, 3]], [[0, 3], [0, 1]])
@@ -266,7 +288,7 @@ def test_what_cannot_be_acted_on_is_refused_with_the_way_out():
     policy = seeded_policy(execution=Execution(sample="stuck"))
     settings = {"num_agents": 3, "height": 6, "width": 6, "fov_radius": 2}
     seen, _ = parallel_env(**settings).reset(seed=0)
-    with pytest.raises(ValueError, match=r"does not say which are stuck: .*\*\*policy.env_settings\(\)"):
+    with pytest.raises(ValueError, match=r"stuck,1 reads stuck, which .* not say: .*\*\*policy.env_settings\(\)"):
         policy.act(seen)
     policy.act(seen, execution=Execution())
     views, _ = parallel_env(**settings, observation="box").reset(seed=0)

@@ -15,7 +15,7 @@ from mapf_env import HISTORY, BatchedEnv, EnvConfig, Instance, Senses
 
 VARIANTS = st.builds(
     Execution,
-    sample=st.sampled_from([False, True, "stuck"]),
+    sample=st.sampled_from([False, True, "stuck", "fallback"]),
     temperature=st.sampled_from([0.3, 1.0, 2.5]),
     shield=st.sampled_from(["idle", "pibt", "pibt_swap"]),
     comm_range=st.sampled_from(["fixed", "connected", None]),
@@ -43,13 +43,13 @@ def test_a_name_without_a_shield_has_the_one_that_is_given():
 
 def test_different_variants_have_different_names():
     choices = itertools.product(
-        *([False, True, "stuck"], [0.5, 1.0], ["idle", "pibt", "pibt_swap"]),
+        *([False, True, "stuck", "fallback"], [0.5, 1.0], ["idle", "pibt", "pibt_swap"]),
         *(["fixed", "connected", None], ["binary", "distance", None]),
     )
     fields = ("sample", "temperature", "shield", "comm_range", "comm_weights")
     settings: list[dict[str, Any]] = [dict(zip(fields, each, strict=True)) for each in choices]
     variants = [Execution(**each) for each in settings]
-    assert len({each.name for each in variants if each.sample}) == 2 * 2 * 3 * 9
+    assert len({each.name for each in variants if each.sample}) == 3 * 2 * 3 * 9
     assert Execution().name == "argmax"
     assert Execution(sample=True, temperature=0.5, shield="pibt").name == "sampled,0.5,pibt"
 
@@ -59,7 +59,7 @@ def test_different_variants_have_different_names():
     [
         (
             "greedily",
-            "'greedily'.*argmax, sampled, stuck, idle, pibt, pibt_swap, fixed, connected, binary, distance or",
+            "'greedily'.*argmax, sampled, stuck, fallback, idle, pibt, pibt_swap, fixed, connected, binary, distance",
         ),
         ("", "unknown word ''"),
         ("sampled,stuck", "sample twice"),
@@ -102,6 +102,30 @@ def test_environments_of_an_execution_show_which_robots_are_stuck(instance: Inst
     for robot, known in enumerate(env.bag().scalars[:, -1]):
         before = [then[robot] for then in track[-HISTORY:]]
         assert known == (here[robot] in before and here[robot] != goals[robot])
+
+
+@pytest.mark.parametrize("own", [(), ("stuck",), ("greedy_moves", "on_goal"), ("stuck", "greedy_moves")])
+def test_a_fallback_is_told_the_greedy_moves_and_who_is_stuck(own):
+    known = Execution(sample="fallback").senses(PolicyConfig(robot_features=own)).robot_features
+    assert known[: len(own)] == own
+    assert sorted(known) == sorted({*own, "greedy_moves", "stuck"})
+
+
+def test_a_fallback_prefers_shorter_ways_then_staying_then_the_draw():
+    fallback, rng = Execution(sample="fallback", temperature=0.5), np.random.default_rng(0)
+    logits = rng.normal(0, 100, (400, 5)).astype(np.float32)
+    alarm, greedy = rng.random(400) < 0.5, rng.random((400, 5)) < 0.4
+    noise = gumbel(np.arange(400, dtype=np.uint64), np.zeros(400, int))
+    scores = fallback.scores(logits, alarm, lambda drawn: noise[drawn], greedy)
+    assert np.array_equal(scores[~alarm], logits[~alarm])
+    drawn = (logits / 0.5 + noise).clip(-333, 333)
+    for robot in np.flatnonzero(alarm):
+        keys = [(2 * greedy[robot, a] or a == 4, drawn[robot, a]) for a in range(5)]
+        ranks = [keys[a] for a in scores[robot].argsort(kind="stable")]
+        assert all(one[0] <= two[0] for one, two in itertools.pairwise(ranks))
+        assert all(one[1] <= two[1] + 1e-2 for one, two in itertools.pairwise(ranks) if one[0] == two[0])
+    with pytest.raises(ValueError, match="needs the moves that shorten"):
+        fallback.scores(logits, alarm, lambda drawn: noise[drawn])
 
 
 def test_an_environment_has_the_senses_of_the_policy_and_the_radio_and_shield_of_the_execution():

@@ -129,7 +129,7 @@ def test_attention_takes_its_softmax_over_the_messages_that_came(seed, count, lo
 
 
 @pytest.mark.parametrize("weights", ["binary", "distance"])
-@pytest.mark.parametrize("sample", [False, True, "stuck"])
+@pytest.mark.parametrize("sample", [False, True, "stuck", "fallback"])
 @pytest.mark.parametrize(("taps", "graph_layer"), [(1, "filter"), (3, "filter"), (3, "attention")])
 def test_a_team_of_robots_walks_the_paths_of_rollout(taps, graph_layer, sample, weights):
     """Views from the PettingZoo environment, actions to a slow world that shares only the shield."""
@@ -153,7 +153,7 @@ def test_a_team_of_robots_walks_the_paths_of_rollout(taps, graph_layer, sample, 
         expected = rollout(policy, [case], max_steps=25, seed=5).solutions[0].paths
         robots = [Robot(policy, seed=int(seed)) for seed in robot_seeds(np.repeat(seeds[-1], 5), np.arange(5))]
         for time, positions in enumerate(expected[:-1]):
-            env = mapf_env.parallel_env(num_agents=5, height=6, width=6, **policy.config.senses())
+            env = mapf_env.parallel_env(num_agents=5, height=6, width=6, **execution.senses(policy.config).senses())
             seen, _ = env.reset(seed=0, options={"instance": case.at(positions)})
             one_step(robots, bag_seen(seen), positions)
             wanted = np.array([[robot.act() for robot in robots]])
