@@ -25,10 +25,11 @@ from rich.console import Console
 
 import experts
 from gnn_policy.command_line import run_command
-from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.config import TrainConfig
 from gnn_policy.evaluation import Estimate, Exam
 from gnn_policy.execution import Execution
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.recipes import RECIPES
 from gnn_policy.rollout import rollout
 from gnn_policy.teacher import Teacher
 from gnn_policy.training import Training

@@ -28,12 +28,12 @@ from rich.progress import Progress
 from gnn_policy import checkpoint, evaluation
 from gnn_policy.acting import tensors
 from gnn_policy.command_line import run_command
-from gnn_policy.config import RECIPES
 from gnn_policy.failures import Failure, count_failures
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.precision import autocast, resolved
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.recipes import RECIPES
 from gnn_policy.results_file import refuse_other_settings
 from gnn_policy.rollout import rollout
 from gnn_policy.run_folder import RunLockedError

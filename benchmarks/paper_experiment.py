@@ -12,10 +12,11 @@ import tyro
 
 from gnn_policy import checkpoint
 from gnn_policy.checkpoint import WEIGHTS
-from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
 from gnn_policy.precision import Precision
+from gnn_policy.recipes import RECIPES
 from mapf_env.generation import MapStyle
 
 Step = Literal["all", "plan", "train", "test", "draw"]

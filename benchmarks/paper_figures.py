@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from gnn_policy.config import RECIPES
+from gnn_policy.recipes import RECIPES
 from mapf_env.files import replacing, write_whole
 from mapf_env.generation import MapStyle
 from paper_experiment import LARGEST, LONGER, PAPER, TEAMS, Experiment, Kind, Model, Scene

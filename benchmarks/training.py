@@ -34,11 +34,12 @@ from torch import nn
 from torch.nn.functional import cross_entropy
 
 from gnn_policy.acting import tensors
-from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.config import TrainConfig
 from gnn_policy.convolution import StridedConvolution
 from gnn_policy.network import ENCODERS, DecentralizedPolicy
 from gnn_policy.precision import Precision, autocast
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.recipes import RECIPES
 from gnn_policy.training import Training
 from mapf_env import Bag, BatchedEnv
 

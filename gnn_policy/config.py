@@ -18,7 +18,6 @@ from mapf_env.arguments import share
 from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
-Recipe = Literal["quick", "full", "paper"]
 RobotOrder = Literal["index", "random", "farthest", "nearest"]
 Aggregation = Literal["visited", "stuck", "plans"]
 Backend = Literal["direct", "process"]
@@ -324,38 +323,3 @@ def _written(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _written(each) for name, each in value.items() if each is not None}
     return [_written(each) for each in value] if isinstance(value, tuple | list) else value
-
-
-_QUICK = TrainConfig(
-    policy=PolicyConfig(encoder="lean"),
-    train_maps=2000,
-    cases_per_map=10,
-    validation_cases_per_map=5,
-    epochs=36,
-    updates_per_epoch=800,
-    batch_size=32,
-    demonstration_steps=32_768,
-    dagger_every=1,
-    dagger_steps=16_384,
-    fresh_share=0.75,
-    augment=True,
-    lr=2e-3,
-)
-
-RECIPES: dict[Recipe, TrainConfig] = {
-    "quick": _QUICK,
-    "full": replace(
-        _QUICK,
-        num_agents=12,
-        styles=("cells", "walls"),
-        train_maps=4000,
-        cases_per_map=20,
-        validation_cases_per_map=10,
-        w=1.0,
-        epochs=120,
-        validate_every=20,
-    ),
-    "paper": TrainConfig(),
-}
-"""Complete sets of settings: one that takes about ten minutes on two CPU cores, that of the policy that comes with the
-package, and the paper's."""

@@ -13,8 +13,9 @@ from rich.console import Console
 
 from gnn_policy import checkpoint
 from gnn_policy.command_line import run_command
-from gnn_policy.config import RECIPES, Recipe, TrainConfig
+from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
+from gnn_policy.recipes import RECIPES, Recipe
 from gnn_policy.results_file import read_tables, settings_of, table_title, variants_of
 from gnn_policy.run_folder import RESULTS, check_run, is_finished
 
@@ -32,8 +33,9 @@ class Command:
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     recipe: Recipe = "quick"
-    """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "full" is
-    that of the policies that come with the package, "paper" the paper's setup."""
+    """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "full" made
+    the paper's models that come with the package, "paper" is the paper's setup, "general" makes the policy for any map
+    and crowds of robots in hours."""
     file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
     """A file of settings, such as the config.toml of another run, instead of a recipe; settings that are not there have
     the defaults of "paper"."""

@@ -11,8 +11,9 @@ import paper
 import paper_experiment
 from gnn_policy import DecentralizedPolicy, load, save
 from gnn_policy.checkpoint import fingerprint
-from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.config import TrainConfig
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.recipes import RECIPES
 from gnn_policy.run_folder import lock_run
 from gnn_policy.training import Training
 from paper_experiment import Experiment, Model, Options, Scene

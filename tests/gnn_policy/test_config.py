@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from gnn_policy import Execution, PolicyConfig
 from gnn_policy.cases import Family, make_cases
-from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.config import TrainConfig
+from gnn_policy.recipes import RECIPES
 from mapf_env import save_map
 from small_training import CONFIG, MIXED
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from gnn_policy import Execution, PolicyConfig, load, results_file, train
-from gnn_policy.config import RECIPES, TrainConfig
+from gnn_policy.config import TrainConfig
+from gnn_policy.recipes import RECIPES
 from mapf_env import save_map
 from small_training import CONFIG, MIXED, arguments_for
 
@@ -31,7 +32,7 @@ def test_the_help_names_every_setting_and_says_what_it_is(capsys, monkeypatch):
     options += [f"execution.{each.name}" for each in fields(Execution)]
     for option in options:
         assert f"--{option.replace('_', '-')}" in text, option
-    for words in ("T_max in makespans", "Filter taps K", "L2 regularisation", "quick", "paper"):
+    for words in ("T_max in makespans", "Filter taps K", "Strength of the weight decay", "quick", "paper"):
         assert words in text
 
 
