@@ -73,7 +73,8 @@ def scores_of(policy: nn.Module, bag: Bag, execution: Execution, noise: Any) -> 
     alarm = facts["stuck"][:, 0] if "stuck" in facts else np.zeros(len(bag.team), np.bool_)
     if config.taps > 1:  # with one tap robots do not communicate
         alarm = alarmed(alarm, bag.edge_index)
-    return execution.scores(logits_of(policy, bag), alarm, noise, facts.get("greedy_moves"))
+    jammed = facts["jammed"][:, 0] if "jammed" in facts else None
+    return execution.scores(logits_of(policy, bag), alarm, noise, facts.get("greedy_moves"), jammed)
 
 
 def facts_of(

@@ -26,7 +26,7 @@ DUST = 1e-15
 """Saved weights smaller than this are set to zero."""
 WEIGHTS = Path(__file__).with_name("weights")
 """The policies that come with the package, and their card, README.md."""
-PACKAGED = WEIGHTS / "n12.safetensors"
+PACKAGED = WEIGHTS / "general.safetensors"
 """The default policy."""
 
 
@@ -94,8 +94,9 @@ def load(path: PathLike = PACKAGED, *, plugins: Collection[str] = ()) -> Decentr
     """Return a policy in evaluation mode.
 
     Args:
-        path: A file, a run folder of `gnn_policy.train`, or the name of a policy that comes with the package: by the
-            robots of its training teams "n4", "n6", "n8", "n10", "n12", or "n12-informed", which sees the cost to go.
+        path: A file, a run folder of `gnn_policy.train`, or the name of a policy that comes with the package:
+            "general", for any map and crowds of robots, which knows the map; the paper's models, by the robots of their
+            training teams "n4", "n6", "n8", "n10" and "n12", which know no map; and "n12-informed", which does.
         plugins: The encoders and graph layers of your own, as "module:Class", that the file may import. Their modules
             run as your code: name only those that you trust.
 

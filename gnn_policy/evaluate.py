@@ -26,18 +26,19 @@ class Command:
     What is not given is as the policy was trained. Results of other settings are never overwritten.
     """
 
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN", help_behavior_hint="(default: n12)")] = (
-        checkpoint.PACKAGED
-    )
+    run: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN", help_behavior_hint="(default: general)")
+    ] = checkpoint.PACKAGED
     """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     num_agents: tuple[int, ...] = ()
     """Team sizes N, one table for each."""
     rows: tuple[str, ...] | None = None
-    """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled" or "stuck"
-    (stuck robots and their neighbours sample); for the latter two a temperature; the shield, "idle", "pibt" or
+    """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled", "stuck"
+    (stuck robots and their neighbours sample) or "fallback" (they follow their shortest way); for the latter three a
+    temperature; the shield, "idle", "pibt" or
     "pibt_swap"; the radio's range, "fixed" or "connected" (the radius grows until the team is connected); edge weights,
     "binary" or "distance". Where a row does not say, the policy's own execution does. If not given: argmax, stuck and
-    sampled."""
+    sampled; for a policy that falls back, that and argmax."""
     split: Literal["validation", "test"] = "test"
     """Which maps: "validation" to choose a row by, "test" to report it."""
     maps: int | None = None

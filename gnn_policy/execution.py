@@ -35,8 +35,9 @@ class Execution:
     sample: Sample = False
     """Draw a robot's move from the softmax instead of taking the most probable one: never, always, or while it or a
     neighbour is "stuck": off its goal and back on a cell where it stood in one of its last 16 steps. "fallback": such
-    robots prefer the moves that shorten their way, then to stay, as PIBT does, and draw among equals. That needs the
-    map, and the shield "pibt_swap" makes the most of it."""
+    robots prefer the moves that shorten their way, then to stay, as PIBT does, and draw among equals; a robot that is
+    jammed, on at most three cells in its last 16 steps, draws among all, those moves preferred. That needs the map,
+    and the shield "pibt_swap" makes the most of it."""
     temperature: float = 1.0
     """Divides the logits where moves are drawn."""
     shield: Shield = "idle"
@@ -64,7 +65,12 @@ class Execution:
             )
 
     def scores(
-        self, logits: Logits, alarmed: Flags, noise: Callable[[Flags], Logits], greedy: Flags | None = None
+        self,
+        logits: Logits,
+        alarmed: Flags,
+        noise: Callable[[Flags], Logits],
+        greedy: Flags | None = None,
+        jammed: Flags | None = None,
     ) -> Logits:
         """Return a score for each move; the greatest is taken, and PIBT takes their order.
 
@@ -76,9 +82,10 @@ class Execution:
             alarmed: (M,) robots that are stuck or hear a robot that is.
             noise: Returns Gumbel noise (m, 5) for the m robots that a mask (M,) selects.
             greedy: (M, 5) the moves that shorten each robot's way, which the fallback reads.
+            jammed: (M,) robots that got nowhere for many steps, which the fallback reads.
 
         Raises:
-            ValueError: If a logit, or a logit over the temperature, is not finite, or the fallback has no greedy moves.
+            ValueError: If a logit, or a logit over the temperature, is not finite, or the fallback lacks what it reads.
         """
         if not np.isfinite(logits).all():
             raise ValueError(
@@ -94,17 +101,18 @@ class Execution:
         if not np.isfinite(scores).all():
             raise ValueError(f"the logits over a temperature of {self.temperature} are not finite: give a higher one")
         if self.sample == "fallback":
-            if greedy is None:
-                raise ValueError("the fallback needs the moves that shorten each robot's way, (M, 5)")
-            tier = 2.0 * greedy[draws]
-            tier[:, Action.IDLE] = np.maximum(tier[:, Action.IDLE], 1.0)
-            scores[draws] = scores[draws].clip(-_TIER / 3, _TIER / 3) + _TIER * tier.astype(np.float32)
+            if greedy is None or jammed is None:
+                raise ValueError("the fallback needs each robot's greedy moves (M, 5) and which robots are jammed (M,)")
+            tier = 2 * greedy[draws].astype(np.float32)
+            tier[:, Action.IDLE] = np.maximum(tier[:, Action.IDLE], 1)
+            weight = np.where(jammed[draws], _JAMMED, _TIER)[:, None]
+            scores[draws] = scores[draws].clip(-_TIER / 3, _TIER / 3) + weight * tier
         return scores
 
     @property
     def features(self) -> tuple[str, ...]:
         """The robot features that this way of execution reads itself."""
-        return {"stuck": ("stuck",), "fallback": ("greedy_moves", "stuck")}.get(str(self.sample), ())
+        return {"stuck": ("stuck",), "fallback": ("greedy_moves", "jammed", "stuck")}.get(str(self.sample), ())
 
     def robot_features(self, policy: PolicyConfig) -> tuple[str, ...]:
         """Return what robots of `policy` know about themselves: what it reads, then what only the execution reads."""
@@ -156,8 +164,9 @@ class Execution:
         return replace(Execution() if base is None else base, **{"sample": False, **given})
 
 
-_TIER = np.float32(1000.0)
-"""The distance between the scores of moves that shorten a robot's way, of staying, and of other moves."""
+_TIER, _JAMMED = np.float32(1000.0), np.float32(2.0)
+"""What the scores of a move that shortens the way, of staying, and of other moves differ by: so much that no draw
+changes their order, or for a jammed robot so little that draws do."""
 _WORD_OF_SAMPLE = {False: "argmax", True: "sampled", "stuck": "stuck", "fallback": "fallback"}
 _OPTION_OF_WORD = {word: ("sample", sample) for sample, word in _WORD_OF_SAMPLE.items()} | {
     word: (option, word)

@@ -37,7 +37,7 @@ class Command:
     POGEMA (.yaml), or a folder of these."""
     agents: int | None = None
     """How many robots: placed at random on a map, else the first ones of the file (all of them if not given)."""
-    run: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: n12)")] = checkpoint.PACKAGED
+    run: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: general)")] = checkpoint.PACKAGED
     """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     map: Path | None = None
     """The map of a scenario, if it does not lie beside it."""

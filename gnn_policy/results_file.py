@@ -10,13 +10,18 @@ from typing import Any
 
 from gnn_policy.cases import Split, Task
 from gnn_policy.config import TrainConfig
-from gnn_policy.execution import Execution
+from gnn_policy.execution import Execution, Sample
 from mapf_env.files import write_whole
 
 
 def variants_of(execution: Execution) -> list[Execution]:
-    """Return the rows that are evaluated by default: argmax, stuck robots sample, all robots sample."""
-    return [replace(execution, sample=sample) for sample in (False, "stuck", True)]
+    """Return the rows that are evaluated by default.
+
+    They are argmax, draws of stuck robots and draws of all; for a policy whose stuck robots fall back on their shortest
+    way, that and argmax.
+    """
+    samples: tuple[Sample, ...] = ("fallback", False) if execution.sample == "fallback" else (False, "stuck", True)
+    return [replace(execution, sample=sample) for sample in samples]
 
 
 def settings_of(

@@ -97,6 +97,7 @@ class Robot:
         self._round = -1
         self._stuck = self._alarmed = False
         self._greedy: npt.NDArray[np.bool_] | None = None
+        self._jammed: npt.NDArray[np.bool_] | None = None
 
     @property
     def rounds(self) -> int:
@@ -146,7 +147,8 @@ class Robot:
         if own.ndim != 1 or not np.isfinite(own).all():
             raise ValueError(f"scalars must be a row of finite numbers, got {own.tolist()}")
         if self._execution.sample == "fallback":
-            self._greedy = facts_of(own[None], self._policy.config, self._execution)["greedy_moves"]
+            facts = facts_of(own[None], self._policy.config, self._execution)
+            self._greedy, self._jammed = facts["greedy_moves"], facts["jammed"][:, 0]
         with torch.inference_mode():
             extracted = self._policy.extract(self._tensor(view)[None], self._tensor(own)[None])
             if not bool(torch.isfinite(extracted).all()):
@@ -219,7 +221,9 @@ class Robot:
         def noise(drawn: npt.NDArray[np.bool_]) -> Features:
             return gumbel(self._seed, np.array([self._time]))
 
-        return self._execution.scores(self.logits()[None], np.array([self._alarmed]), noise, self._greedy)[0]
+        return self._execution.scores(
+            self.logits()[None], np.array([self._alarmed]), noise, self._greedy, self._jammed
+        )[0]
 
     def act(self) -> int:
         """Return the move that it wants, 0..4, the one with the greatest score; the world's shield has the last word.

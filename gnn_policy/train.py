@@ -64,9 +64,26 @@ def parse(arguments: Sequence[str]) -> Command:
         config = replace(
             config, policy=checkpoint.config_of(chosen.init), execution=checkpoint.executed_as(chosen.init)
         )
-    return tyro.cli(
+    command = tyro.cli(
         Command, args=arguments, default=Command(config, chosen.recipe, chosen.file), prog="python -m gnn_policy.train"
     )
+    _refuse_unused(command.config, config)
+    return command
+
+
+def _refuse_unused(config: TrainConfig, defaults: TrainConfig) -> None:
+    """Raise ValueError if an option was given that files or families of cases leave without effect."""
+    unused = ("height", "width", "density", "styles")
+    if config.files:
+        source, cure = "files", "the maps are those of the files"
+    elif config.families:
+        source, cure = "families", "change the [[families]] of a file of settings and give it with --config"
+        unused += ("num_agents",)
+    else:
+        return
+    for name in unused:
+        if getattr(config, name) != getattr(defaults, name):
+            raise ValueError(f"--{name.replace('_', '-')} has no effect on a training with {source}: {cure}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -159,6 +159,25 @@ void write_stuck(const TeamFacts& team, int, int robot, float* out) {
     }
 }
 
+// Off the goal, and on at most three cells in all of its last steps.
+void write_jammed(const TeamFacts& team, int, int robot, float* out) {
+    *out = 0.0f;
+    if (team.on_goal(robot)) return;
+    std::array<std::array<int, 2>, 3> stood{};  // relative to where it is now
+    int cells = 1, down = 0, right = 0;
+    for (int k = 0; k < history; ++k) {
+        const int move = team.moves[robot * history + k];
+        if (move < 0) return;
+        down -= row_step[move];
+        right -= col_step[move];
+        const std::array<int, 2> cell{down, right};
+        if (std::find(stood.begin(), stood.begin() + cells, cell) != stood.begin() + cells) continue;
+        if (cells == static_cast<int>(stood.size())) return;
+        stood[cells++] = cell;
+    }
+    *out = 1.0f;
+}
+
 // ---- features of edges alone
 
 void write_relative_position(const TeamFacts& team, int, int receiver, int sender, float* out) {
@@ -219,6 +238,7 @@ constexpr std::array all_robot_features{
     RobotFeature{"under_way", width<1>, 0, 1, false, true, write_under_way},
     RobotFeature{"greedy_moves", width<5>, 0, 1, true, false, write_greedy_moves},
     RobotFeature{"stuck", width<1>, 0, 1, false, true, write_stuck},
+    RobotFeature{"jammed", width<1>, 0, 1, false, true, write_jammed},
 };
 
 constexpr std::array all_edge_features{

@@ -242,7 +242,7 @@ def test_robots_draw_when_they_are_stuck_or_hear_one_that_is(taps, knows):
     assert (taken[:, still] == by_argmax[still]).all()
 
 
-@pytest.mark.parametrize("own", [(), ("stuck", "on_goal", "greedy_moves")])
+@pytest.mark.parametrize("own", [(), ("stuck", "jammed", "on_goal", "greedy_moves")])
 def test_robots_that_are_stuck_or_hear_one_fall_back_on_their_shortest_way(own):
     execution = Execution(sample="fallback", temperature=0.5, shield="pibt_swap")
     policy = seeded_policy(execution=execution, robot_features=own, comm_radius=1.5)

@@ -104,19 +104,19 @@ def test_environments_of_an_execution_show_which_robots_are_stuck(instance: Inst
         assert known == (here[robot] in before and here[robot] != goals[robot])
 
 
-@pytest.mark.parametrize("own", [(), ("stuck",), ("greedy_moves", "on_goal"), ("stuck", "greedy_moves")])
-def test_a_fallback_is_told_the_greedy_moves_and_who_is_stuck(own):
+@pytest.mark.parametrize("own", [(), ("stuck",), ("greedy_moves", "on_goal"), ("stuck", "greedy_moves", "jammed")])
+def test_a_fallback_is_told_the_greedy_moves_and_who_is_stuck_or_jammed(own):
     known = Execution(sample="fallback").senses(PolicyConfig(robot_features=own)).robot_features
     assert known[: len(own)] == own
-    assert sorted(known) == sorted({*own, "greedy_moves", "stuck"})
+    assert sorted(known) == sorted({*own, "greedy_moves", "stuck", "jammed"})
 
 
 def test_a_fallback_prefers_shorter_ways_then_staying_then_the_draw():
     fallback, rng = Execution(sample="fallback", temperature=0.5), np.random.default_rng(0)
     logits = rng.normal(0, 100, (400, 5)).astype(np.float32)
-    alarm, greedy = rng.random(400) < 0.5, rng.random((400, 5)) < 0.4
+    alarm, greedy, jammed = rng.random(400) < 0.5, rng.random((400, 5)) < 0.4, np.zeros(400, bool)
     noise = gumbel(np.arange(400, dtype=np.uint64), np.zeros(400, int))
-    scores = fallback.scores(logits, alarm, lambda drawn: noise[drawn], greedy)
+    scores = fallback.scores(logits, alarm, lambda drawn: noise[drawn], greedy, jammed)
     assert np.array_equal(scores[~alarm], logits[~alarm])
     drawn = (logits / 0.5 + noise).clip(-333, 333)
     for robot in np.flatnonzero(alarm):
@@ -124,8 +124,23 @@ def test_a_fallback_prefers_shorter_ways_then_staying_then_the_draw():
         ranks = [keys[a] for a in scores[robot].argsort(kind="stable")]
         assert all(one[0] <= two[0] for one, two in itertools.pairwise(ranks))
         assert all(one[1] <= two[1] + 1e-2 for one, two in itertools.pairwise(ranks) if one[0] == two[0])
-    with pytest.raises(ValueError, match="needs the moves that shorten"):
+    with pytest.raises(ValueError, match="needs each robot's greedy moves"):
         fallback.scores(logits, alarm, lambda drawn: noise[drawn])
+
+
+def test_a_jammed_robot_draws_among_all_moves_and_shorter_ways_are_likelier():
+    count = 20_000
+    logits, greedy = (
+        np.tile(np.log([0.3, 0.3, 0.2, 0.1, 0.1]).astype(np.float32), (count, 1)),
+        np.zeros((count, 5), bool),
+    )
+    greedy[:, 3] = True
+    noise = gumbel(np.arange(count, dtype=np.uint64), np.zeros(count, int))
+    everyone = np.ones(count, bool)
+    scores = Execution(sample="fallback").scores(logits, everyone, lambda drawn: noise[drawn], greedy, everyone)
+    weights = np.array([0.3, 0.3, 0.2, 0.1 * np.exp(4), 0.1 * np.exp(2)])
+    shares = np.bincount(scores.argmax(1), minlength=5) / count
+    np.testing.assert_allclose(shares, weights / weights.sum(), atol=0.015)
 
 
 def test_an_environment_has_the_senses_of_the_policy_and_the_radio_and_shield_of_the_execution():

@@ -47,6 +47,22 @@ def test_an_option_for_every_setting_reaches_the_settings():
     assert quick == replace(RECIPES["quick"], policy=replace(RECIPES["quick"].policy, taps=1))
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--recipe general --num-agents 7", "--num-agents has no effect on a training with families: change the"),
+        ("--recipe general --density 0.2", "--density has no effect on a training with families"),
+        ("--files depot.map --styles walls", "--styles has no effect on a training with files: the maps are those"),
+    ],
+)
+def test_options_that_have_no_effect_are_refused(capsys, options, words):
+    with pytest.raises(SystemExit) as end:
+        train.main(options.split())
+    assert end.value.code == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert train.parse(["--files", "depot.map", "--num-agents", "7"]).config.num_agents == 7
+
+
 def test_a_file_of_settings_is_the_base_of_the_other_options_and_names_the_run(tmp_path):
     MIXED.save(tmp_path / "mixed.toml")
     command = train.parse(["--config", str(tmp_path / "mixed.toml"), "--lr", "0.5", "--policy.taps", "2"])

@@ -172,6 +172,15 @@ def stuck(world: World, robot: int) -> list[float]:
     return [world.team[robot] != world.goals[robot] and tuple(world.team[robot]) in earlier]
 
 
+def jammed(world: World, robot: int) -> list[float]:
+    row, col = world.team[robot]
+    cells = {(row, col)}
+    for move in world.moves[robot]:
+        row, col = row - MOVES[move][0], col - MOVES[move][1]
+        cells.add((row, col))
+    return [world.team[robot] != world.goals[robot] and min(world.moves[robot]) >= 0 and len(cells) <= 3]
+
+
 ROBOT_FEATURES: dict[str, Callable[[World, int], list[float]]] = {
     "last_moves": last_moves,
     "on_goal": on_goal,
@@ -180,6 +189,7 @@ ROBOT_FEATURES: dict[str, Callable[[World, int], list[float]]] = {
     "under_way": under_way,
     "greedy_moves": greedy_moves,
     "stuck": stuck,
+    "jammed": jammed,
 }
 
 
@@ -299,7 +309,7 @@ def test_what_needs_the_map_says_so() -> None:
     assert Senses(edge_features=("greedy_moves",)).needs_map
     tables = channels(), robot_features(), edge_features()
     history = {name for table in tables for name, facts in table.items() if facts.needs_history}
-    assert history == {"previous_positions", "last_moves", "under_way", "priority", "stuck"}
+    assert history == {"previous_positions", "last_moves", "under_way", "priority", "stuck", "jammed"}
 
 
 def test_the_senses_of_an_environment_are_passed_on_as_settings() -> None:
