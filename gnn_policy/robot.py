@@ -97,7 +97,7 @@ class Robot:
         self._round = -1
         self._stuck = self._alarmed = False
         self._greedy: npt.NDArray[np.bool_] | None = None
-        self._jammed: npt.NDArray[np.bool_] | None = None
+        self._jammed = np.zeros(1, np.bool_)
 
     @property
     def rounds(self) -> int:
@@ -147,8 +147,7 @@ class Robot:
         if own.ndim != 1 or not np.isfinite(own).all():
             raise ValueError(f"scalars must be a row of finite numbers, got {own.tolist()}")
         if self._execution.sample == "fallback":
-            facts = facts_of(own[None], self._policy.config, self._execution)
-            self._greedy, self._jammed = facts["greedy_moves"], facts["jammed"][:, 0]
+            self._greedy = facts_of(own[None], self._policy.config, self._execution)["greedy_moves"]
         with torch.inference_mode():
             extracted = self._policy.extract(self._tensor(view)[None], self._tensor(own)[None])
             if not bool(torch.isfinite(extracted).all()):
@@ -160,6 +159,8 @@ class Robot:
         place, centre = tuple(int(each) for each in cell), view.shape[-1] // 2
         on_goal = bool(view[1, centre, centre])
         self._stuck = self._alarmed = not on_goal and place in self._track
+        cells = len({*self._track, place})
+        self._jammed = np.array([not on_goal and len(self._track) == HISTORY and cells <= 3])
         self._track.append(place)
 
     @property

@@ -98,7 +98,7 @@ def test_a_policy_of_the_package_is_loaded_by_its_name_unless_there_is_such_a_fi
     save(policy, "n10")
     assert load("n10").config == CONFIG
     for missing in ("n11", f"../{checkpoint.WEIGHTS.name}/n12"):
-        with pytest.raises(FileNotFoundError, match="one of n10, n12, n12-informed, n4, n6, n8"):
+        with pytest.raises(FileNotFoundError, match="one of general, n10, n12, n12-informed, n4, n6, n8"):
             load(missing)
 
 
@@ -394,6 +394,9 @@ def test_the_packaged_policies_say_how_they_are_executed():
     for file in checkpoint.WEIGHTS.glob("*.safetensors"):
         trained, execution = checkpoint.trained_with(file), checkpoint.executed_as(file)
         assert load(file).execution == execution
-        assert execution == Execution(sample="stuck", shield="pibt" if file.stem == "n12-informed" else "idle")
+        assert execution == {
+            "general": Execution(sample="fallback", temperature=1.5, shield="pibt_swap"),
+            "n12-informed": Execution(sample="stuck", shield="pibt"),
+        }.get(file.stem, Execution(sample="stuck"))
         assert trained.execution == execution
         assert trained.policy == load(file).config

@@ -75,7 +75,7 @@ def test_rows_play_under_the_shield_that_the_policys_file_says(monkeypatch, tmp_
     assert how["variants"] == [Execution(shield="pibt"), Execution(sample="stuck")]
     assert str(folder) == "evaluation/n12-informed"
     _, folder, how = examined(monkeypatch, "--rows", "argmax")
-    assert how["variants"] == [Execution(shield="pibt_swap", temperature=0.5)]
+    assert how["variants"] == [Execution(shield="pibt_swap", temperature=1.5)]
     assert str(folder) == "evaluation/general"
     _, _, how = examined(monkeypatch)
     assert [each.sample for each in how["variants"]] == ["fallback", False]
