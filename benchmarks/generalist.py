@@ -32,7 +32,7 @@ from mapf_env import Instance
 
 STEPS = 128
 SEED = 1
-"""Of the maps and cases, and of the draws; training's own validation maps have another."""
+"""The seed of maps, cases and draws; the validation maps of training have a different one."""
 SETS = {
     "random": [Family(height=(17, 21), width=(17, 21), density=(0.2, 0.2))],
     "mazes": [
@@ -57,7 +57,7 @@ class Options:
     policy: Annotated[str, tyro.conf.Positional]
     """A run folder, a .safetensors file, or the name of a policy of the package."""
     rows: tuple[str, ...] = ()
-    """How the policy is executed, as in gnn_policy.evaluate; as its file says if not given."""
+    """Ways to execute the policy, in the words of gnn_policy.evaluate; the policy's own if not given."""
     sets: tuple[str, ...] = tuple(SETS)
     """Kinds of maps."""
     sizes: tuple[int, ...] = (16, 32, 48, 64)

@@ -1,4 +1,4 @@
-"""What a solver answers: a solution with its proof of quality, or the reason why there is none or it is not proved."""
+"""What a solver answers: how its search ended, the plan that it found, and the lower bound that it proved."""
 
 from __future__ import annotations
 

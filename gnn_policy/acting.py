@@ -70,9 +70,11 @@ def scores_of(policy: nn.Module, bag: Bag, execution: Execution, noise: Any) -> 
     """
     config: PolicyConfig = policy.config  # pyright: ignore[reportAssignmentType]
     facts = facts_of(bag.scalars, config, execution)
-    alarm = facts["stuck"][:, 0] if "stuck" in facts else np.zeros(len(bag.team), np.bool_)
-    if config.taps > 1:  # with one tap robots do not communicate
-        alarm = alarmed(alarm, bag.edge_index)
+    alarm = np.zeros(len(bag.team), np.bool_)
+    if "stuck" in facts:
+        alarm = facts["stuck"][:, 0]
+        if config.taps > 1:  # with one tap robots do not communicate
+            alarm = alarmed(alarm, bag.edge_index)
     jammed = facts["jammed"][:, 0] if "jammed" in facts else None
     return execution.scores(logits_of(policy, bag), alarm, noise, facts.get("greedy_moves"), jammed)
 
@@ -85,15 +87,17 @@ def facts_of(
     Raises:
         ValueError: If they are not among the scalars.
     """
+    if not execution.features:
+        return {}
     names, known = execution.robot_features(config), robot_features(config.memory)
     ends = np.cumsum([known[name].width for name in names])
-    if execution.features and ends[-1] > scalars.shape[1]:
+    if ends[-1] > scalars.shape[1]:
         raise ValueError(
             f"the execution {execution.name} reads {' and '.join(execution.features)}, which the observation does not "
             "say: make the environment with **policy.env_settings(), or pass execution=Execution()"
         )
-    columns = dict(zip(names, np.split(scalars, ends[:-1], axis=1), strict=True)) if execution.features else {}
-    return {name: columns[name][:, : known[name].width] > 0 for name in execution.features}
+    columns = dict(zip(names, np.split(scalars[:, : ends[-1]], ends[:-1], axis=1), strict=True))
+    return {name: columns[name] > 0 for name in execution.features}
 
 
 def act(policy: nn.Module, observation: Any, execution: Execution, rng: np.random.Generator) -> Any:

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dataclasses import asdict, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import safetensors
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     import torch
 
     from gnn_policy.network import DecentralizedPolicy
+
+T = TypeVar("T")
 
 FORMAT = "mapf-env policy 2"
 DUST = 1e-15
@@ -195,10 +197,7 @@ def config_of(path: PathLike) -> PolicyConfig:
         FileNotFoundError: If there is no such file.
         CheckpointError: If the file is damaged or comes from another program.
     """
-    try:
-        return PolicyConfig(**_json_object(about(path)["policy"]))
-    except (KeyError, TypeError, ValueError, RecursionError) as wrong:
-        raise CheckpointError(f"{file_of(path)}: its configuration is damaged: {wrong}") from wrong
+    return _described(path, "policy", PolicyConfig, "its configuration is damaged")
 
 
 def executed_as(path: PathLike) -> Execution:
@@ -208,10 +207,15 @@ def executed_as(path: PathLike) -> Execution:
         FileNotFoundError: If there is no such file.
         CheckpointError: If the file is damaged or comes from another program.
     """
+    return _described(path, "execution", Execution, "how to execute the policy is not readable")
+
+
+def _described(path: PathLike, name: str, kind: type[T], fault: str) -> T:
+    """Return a part of the metadata as a dataclass of this kind."""
     try:
-        return Execution(**_json_object(about(path)["execution"]))
+        return kind(**_json_object(about(path)[name]))
     except (KeyError, TypeError, ValueError, RecursionError) as wrong:
-        raise _misfit(file_of(path), wrong, "how to execute the policy is not readable") from wrong
+        raise _misfit(file_of(path), wrong, fault) from wrong
 
 
 def fingerprint(policy: DecentralizedPolicy) -> str:

@@ -195,8 +195,9 @@ class Training:
                 collected.save(self._shard(number))
             self._shards.append(collected)
         demonstrations = Demonstrations.concatenate(self._shards)
-        if config.kept_states is not None and len(demonstrations) > config.kept_states:
-            demonstrations = demonstrations.take(np.arange(-config.kept_states, 0) + len(demonstrations))
+        size = len(demonstrations)
+        if config.kept_states is not None and size > config.kept_states:
+            demonstrations = demonstrations.take(np.arange(size - config.kept_states, size))
         self._shards = [demonstrations]
         if len(demonstrations) == 0:
             raise ValueError("the expert solved none of the visited states: raise expert_nodes or make cases easier")
