@@ -33,6 +33,8 @@ class Progress(TrainingProgress):
         report["demonstrations"] = torch.tensor([len(s) for s in run._shards])
         report["loss"] = torch.tensor([row.loss, row.accuracy])
         torch.save(report, folder.parent / f"{folder.name}-{ranks.rank}-{row.round}.pt")
+    def due(self):
+        return True  # every update, however fast the machine
     def fitted(self, number, update, *rest):
         if ranks.rank == victim and number == when and update == 2:
             os.kill(os.getpid(), signal.SIGKILL)
