@@ -34,10 +34,10 @@ class Execution:
 
     sample: Sample = False
     """Draw a robot's move from the softmax instead of taking the most probable one: never, always, or while it or a
-    neighbour is "stuck": off its goal and back on a cell where it stood in one of its last 16 steps. "fallback": such
-    robots prefer the moves that shorten their way, then to stay, as PIBT does, and draw among equals; a robot that is
-    jammed, on at most three cells in its last 16 steps, draws among all, those moves preferred. That needs the map,
-    and the shield "pibt_swap" makes the most of it."""
+    neighbour is "stuck": off its goal and back on a cell where it stood in one of its last 16 steps. "fallback": a
+    robot that is stuck itself prefers the moves that shorten its way, then to stay, as PIBT does, and draws among
+    equals; a robot that is jammed, on at most three cells in its last 16 steps, draws among all, those moves
+    preferred. That needs the map, and the shield "pibt_swap" makes the most of it."""
     temperature: float = 1.0
     """Divides the logits where moves are drawn."""
     shield: Shield = "idle"
@@ -79,7 +79,7 @@ class Execution:
 
         Args:
             logits: (M, 5) of robots.
-            alarmed: (M,) robots that are stuck or hear a robot that is.
+            alarmed: (M,) robots that are stuck or, unless for the fallback, hear a robot that is.
             noise: Returns Gumbel noise (m, 5) for the m robots that a mask (M,) selects.
             greedy: (M, 5) the moves that shorten each robot's way, which the fallback reads.
             jammed: (M,) robots that got nowhere for many steps, which the fallback reads.

@@ -189,7 +189,7 @@ class Robot:
                 raise ValueError(
                     f"{name!r} sent features that are not finite: leave the message out as if it were lost"
                 )
-            self._alarmed |= message.stuck
+            self._alarmed |= message.stuck and self._execution.sample == "stuck"
         names = [name for name in self._weights if name in messages]  # in the links' order, as the network sums them
         heard = np.array([messages[name].features for name in names], np.float32).reshape(len(names), *size)
         with torch.inference_mode():
