@@ -34,10 +34,11 @@ class Command:
     """Team sizes N, one table for each."""
     rows: tuple[str, ...] | None = None
     """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled", "stuck"
-    (stuck robots and their neighbours sample) or "fallback" (stuck robots follow their shortest way); for the latter three
-    a temperature; the shield, "idle", "pibt" or "pibt_swap"; the radio's range, "fixed" or "connected" (the radius grows until the team is connected); edge weights,
-    "binary" or "distance". Where a row does not say, the policy's own execution does. If not given: argmax, stuck and
-    sampled; for a policy that falls back, that and argmax."""
+    (stuck robots and their neighbours sample) or "fallback" (stuck robots follow their shortest way); for the
+    latter three a temperature; the shield, "idle", "pibt" or "pibt_swap"; the radio's range, "fixed" or "connected"
+    (the radius grows until the team is connected); edge weights, "binary" or "distance". Where a row does not say,
+    the policy's own execution does. If not given: argmax, stuck and sampled; for a policy that falls back, that and
+    argmax."""
     split: Literal["validation", "test"] = "test"
     """Which maps: "validation" to choose a row by, "test" to report it."""
     maps: int | None = None
