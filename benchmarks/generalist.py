@@ -1,7 +1,7 @@
 """The general policy on validation maps: its execution is chosen here, never on POGEMA's benchmark.
 
     python benchmarks/generalist.py runs/general
-    python benchmarks/generalist.py runs/general --rows stuck,0.5,pibt sampled,0.5,pibt --sizes 32 64
+    python benchmarks/generalist.py runs/general --executions stuck,0.5,pibt sampled,0.5,pibt --sizes 32 64
 
 The maps are random, with the statistics of POGEMA's sets "random" and "mazes": 17 to 21 cells a side, 128 steps. A
 policy never trains on them, for they belong to the validation split. SoC is the sum of the last arrivals; a robot that
@@ -56,7 +56,7 @@ class Options:
 
     policy: Annotated[str, tyro.conf.Positional]
     """A run folder, a .safetensors file, or the name of a policy of the package."""
-    rows: tuple[str, ...] = ()
+    executions: tuple[str, ...] = ()
     """Ways to execute the policy, in the words of gnn_policy.evaluate; the policy's own if not given."""
     sets: tuple[str, ...] = tuple(SETS)
     """Kinds of maps."""
@@ -76,7 +76,7 @@ def main(options: Options) -> None:
     """Print success, ISR, SoC and the seconds that a step of one team takes in the batch."""
     torch.set_num_threads(1)
     policy = checkpoint.load(options.policy).eval()
-    executions = [Execution.parse(row, policy.execution) for row in options.rows] or [policy.execution]
+    executions = [Execution.parse(row, policy.execution) for row in options.executions] or [policy.execution]
     actors: dict[str, Actor] = {each.name: PolicyActor(policy, each) for each in executions}
     actors |= {"PIBT": GreedyActor(shield="pibt"), "PIBT with swap": GreedyActor(shield="pibt_swap")}
     table = Table("maps", "robots", "row", "success", "ISR", "SoC", "ms a step", title=options.policy)

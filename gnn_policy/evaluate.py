@@ -1,4 +1,4 @@
-"""`python -m gnn_policy.evaluate RUN`: examine any policy on held-out maps."""
+"""`python -m gnn_policy.evaluate POLICY`: examine any policy on held-out maps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gnn_policy.cases import Task
 from gnn_policy.command_line import run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
-from gnn_policy.results_file import refuse_other_settings, settings_of, variants_of
+from gnn_policy.results_file import default_executions, refuse_other_settings, settings_of
 from mapf_env.generation import MapStyle
 
 
@@ -26,21 +26,21 @@ class Command:
     What is not given is as the policy was trained. Results of other settings are never overwritten.
     """
 
-    run: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN", help_behavior_hint="(default: general)")
+    policy: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY", help_behavior_hint="(default: general)")
     ] = checkpoint.PACKAGED
     """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     num_agents: tuple[int, ...] = ()
     """Team sizes N, one table for each."""
-    rows: tuple[str, ...] | None = None
+    executions: tuple[str, ...] | None = None
     """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled", "stuck"
     (stuck robots and their neighbours sample) or "fallback" (stuck robots follow their shortest way); for the
     latter three a temperature; the shield, "idle", "pibt" or "pibt_swap"; the radio's range, "fixed" or "connected"
-    (the radius grows until the team is connected); edge weights, "binary" or "distance". Where a row does not say,
+    (the radius grows until the team is connected); edge weights, "binary" or "distance". Where it does not say,
     the policy's own execution does. If not given: argmax, stuck and sampled; for a policy that falls back, that and
     argmax."""
     split: Literal["validation", "test"] = "test"
-    """Which maps: "validation" to choose a row by, "test" to report it."""
+    """Which maps: "validation" to choose an execution, "test" to report it."""
     maps: int | None = None
     """How many of them."""
     cases_per_map: int | None = None
@@ -70,8 +70,8 @@ class Command:
     seed: int | None = None
     """Random seed for sampling and for the shield's tie-breaking."""
     failures: int = 0
-    """How many cases of the first row to replay beside the expert's solutions, in failures.html: the worst of each kind
-    of failure, then the next worst."""
+    """How many cases of the first execution to replay next to the expert's solutions, in failures.html: the worst of
+    each kind of failure, then the next worst."""
     out: Path | None = None
     """Folder for results.json and pictures; if not given, evaluation/ in the run folder or beside the file, and
     evaluation/NAME in the working folder for a policy that comes with the package."""
@@ -97,7 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _evaluate(command: Command) -> None:
     """Refuse what can be refused without torch, then evaluate."""
-    trained = checkpoint.trained_with(command.run)
+    trained = checkpoint.trained_with(command.policy)
     names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
     given = {name: value for name in names if (value := getattr(command, name)) is not None}
     if given.keys() & {"height", "width", "density", "styles"}:
@@ -114,15 +114,15 @@ def _evaluate(command: Command) -> None:
     if command.task is not None:
         given["task"] = command.task
     config = replace(trained, **given)
-    execution = checkpoint.executed_as(command.run)
-    variants = variants_of(execution)
-    if command.rows is not None:
-        variants = [Execution.parse(row, execution) for row in command.rows]
+    execution = checkpoint.executed_as(command.policy)
+    executions = default_executions(execution)
+    if command.executions is not None:
+        executions = [Execution.parse(row, execution) for row in command.executions]
     threads = cpu_threads(command.threads)
-    folder = command.out or _home(command.run)
+    folder = command.out or _home(command.policy)
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"{folder} is not a folder: give another one with --out")
-    settings = settings_of(config, command.num_agents, variants, command.split, config.task)
+    settings = settings_of(config, command.num_agents, executions, command.split, config.task)
     refuse_other_settings(folder / "results.json", settings, "--out")
 
     import torch
@@ -131,7 +131,7 @@ def _evaluate(command: Command) -> None:
     from gnn_policy.examination import examine
 
     torch.set_num_threads(threads)
-    policy = on_device(checkpoint.load(command.run, plugins=command.plugins), command.device)
+    policy = on_device(checkpoint.load(command.policy, plugins=command.plugins), command.device)
     folder.mkdir(parents=True, exist_ok=True)
     examine(
         policy,
@@ -139,7 +139,7 @@ def _evaluate(command: Command) -> None:
         folder,
         Console(),
         num_agents=command.num_agents,
-        variants=variants,
+        executions=executions,
         split=command.split,
         task=config.task,
         whole=bool(command.files),
@@ -149,8 +149,8 @@ def _evaluate(command: Command) -> None:
     )
 
 
-def _home(run: Path) -> Path:
-    file = checkpoint.file_of(run)
+def _home(policy: Path) -> Path:
+    file = checkpoint.file_of(policy)
     return Path("evaluation", file.stem) if file.parent == checkpoint.WEIGHTS else file.parent / "evaluation"
 
 

@@ -152,7 +152,7 @@ def score(name: str, exam: Exam, rollouts: Rollouts) -> Score:
 def compare(
     exam: Exam,
     policy: DecentralizedPolicy,
-    variants: Sequence[Execution],
+    executions: Sequence[Execution],
     *,
     seed: int = 0,
     progress: Callable[[str], None] = lambda phase: None,
@@ -160,14 +160,14 @@ def compare(
     """The results table of a policy beside the expert and baselines that learn nothing, on the same cases.
 
     Returns:
-        The rows, those of the variants first, and what the policy did in each variant.
+        The rows, those of the executions first, and what the policy did in each execution.
     """
     rows, played = [], []
     mark = "*" if policy.config.needs_map else ""
-    for variant in variants:
-        progress(variant.name)
-        played.append(rollout(policy, exam.instances, execution=variant, seed=seed, max_steps=exam.max_steps))
-        rows.append(score(variant.name + mark, exam, played[-1]))
+    for execution in executions:
+        progress(execution.name)
+        played.append(rollout(policy, exam.instances, execution=execution, seed=seed, max_steps=exam.max_steps))
+        rows.append(score(execution.name + mark, exam, played[-1]))
     return [*rows, *baselines(exam, seed=seed, progress=progress)], played
 
 
@@ -221,7 +221,7 @@ LIFELONG_BASELINES = {"random": RandomActor(), "greedy*": GreedyActor(), "PIBT*"
 def compare_lifelong(
     instances: Sequence[Instance],
     policy: DecentralizedPolicy,
-    variants: Sequence[Execution],
+    executions: Sequence[Execution],
     *,
     steps: int,
     seed: int = 0,
@@ -230,14 +230,14 @@ def compare_lifelong(
     """Return the throughput of a policy and of `LIFELONG_BASELINES` on the same cases as plain data.
 
     Returns:
-        The table, the variants' rows first, and the policy's rollouts in each variant.
+        The table, the executions' rows first, and the policy's rollouts in each execution.
     """
     rows, played = [], []
     mark = "*" if policy.config.needs_map else ""
-    for variant in variants:
-        progress(variant.name)
-        played.append(rollout(policy, instances, task="lifelong", execution=variant, seed=seed, max_steps=steps))
-        rows.append(_throughput(variant.name + mark, played[-1]))
+    for execution in executions:
+        progress(execution.name)
+        played.append(rollout(policy, instances, task="lifelong", execution=execution, seed=seed, max_steps=steps))
+        rows.append(_throughput(execution.name + mark, played[-1]))
     for name, actor in LIFELONG_BASELINES.items():
         progress(name)
         rows.append(_throughput(name, rollout(actor, instances, task="lifelong", seed=seed, max_steps=steps)))

@@ -16,12 +16,12 @@ from gnn_policy.execution import Execution
 from gnn_policy.failures import count_failures, worst
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.results_file import (
+    default_executions,
     read_tables,
     refuse_other_settings,
     settings_of,
     table_title,
     tables_of,
-    variants_of,
     write_tables,
 )
 from gnn_policy.rollout import Rollouts
@@ -35,7 +35,7 @@ def examine(
     console: Console,
     *,
     num_agents: Sequence[int] = (),
-    variants: Sequence[Execution] | None = None,
+    executions: Sequence[Execution] | None = None,
     split: Split = "test",
     task: Task = "one_shot",
     steps: int = evaluation.LIFELONG_STEPS,
@@ -54,22 +54,22 @@ def examine(
         folder: Where the files go.
         console: Where the tables go.
         num_agents: Team sizes N; those of `config` if none is given.
-        variants: How to execute the policy, one row for each; `variants_of(policy.execution)` if not given.
+        executions: How to execute the policy, one row for each; `default_executions(policy.execution)` if not given.
         split: Which maps.
         task: "lifelong" shows throughput, without the expert.
         steps: Steps of a lifelong episode.
         whole: Play all cases of the files, also those that a training on them would have kept for itself.
         threads: CPU threads of the expert.
-        failures: How many cases of the first variant to show next to the expert's solutions, for each table, in
+        failures: How many cases of the first execution to show next to the expert's solutions, for each table, in
             failures.html; the worst of each kind of failure come first. With them every table is computed.
 
     Raises:
-        ValueError: If there is no variant, or `failures` is negative or asked for in a lifelong task.
+        ValueError: If there is no execution, or `failures` is negative or asked for in a lifelong task.
         FileExistsError: If the folder has results of other settings.
     """
-    if variants is None:
-        variants = variants_of(policy.execution)
-    if not variants:
+    if executions is None:
+        executions = default_executions(policy.execution)
+    if not executions:
         raise ValueError("there is no way to execute the policy: give at least one row")
     if failures < 0:
         raise ValueError(f"failures must not be negative, got {failures}")
@@ -77,7 +77,7 @@ def examine(
         raise ValueError("a lifelong team cannot fail: leave failures out")
     settings = {
         "policy": checkpoint.fingerprint(policy),
-        **settings_of(config, num_agents, variants, split, task),
+        **settings_of(config, num_agents, executions, split, task),
         **({"steps": steps} if task == "lifelong" else {}),
     }
     cases, numbers = tables_of(config, num_agents), folder / "results.json"
@@ -89,7 +89,7 @@ def examine(
     rivals = evaluation.BASELINES if task == "one_shot" else evaluation.LIFELONG_BASELINES
     scenes: list[Scene] = []
     with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task("", total=len(held_out) * (len(variants) + len(rivals)))
+        bar = progress.add_task("", total=len(held_out) * (len(executions) + len(rivals)))
         for name in cases:
             title = table_title(name, settings)
             if name in finished:
@@ -101,21 +101,21 @@ def examine(
 
             if task == "lifelong":
                 tables[name], shown = evaluation.compare_lifelong(
-                    held_out[name], policy, variants, steps=steps, seed=config.seed, progress=advance
+                    held_out[name], policy, executions, steps=steps, seed=config.seed, progress=advance
                 )
             else:
                 progress.update(bar, description=f"{title}: expert")
                 exam = evaluation.Exam.prepare(
                     held_out[name], w=config.w, timeout=config.timeout, threads=threads, nodes=config.exam_nodes
                 )
-                rows, shown = evaluation.compare(exam, policy, variants, seed=config.seed, progress=advance)
+                rows, shown = evaluation.compare(exam, policy, executions, seed=config.seed, progress=advance)
                 progress.advance(bar)
-                kinds = {each.name: count_failures(played) for each, played in zip(variants, shown, strict=True)}
+                kinds = {each.name: count_failures(played) for each, played in zip(executions, shown, strict=True)}
                 tables[name] = {**evaluation.as_json(rows, exam), "failures": kinds}
                 if failures:
                     scenes += worst(shown[0], exam.solutions, failures)
-                    heading = f"The worst cases of {variants[0].name} next to the expert's solutions"
-                    perceived = EnvConfig(**variants[0].env_settings(policy.config))
+                    heading = f"The worst cases of {executions[0].name} next to the expert's solutions"
+                    perceived = EnvConfig(**executions[0].env_settings(policy.config))
                     replay_scenes(scenes, folder / "failures.html", title=heading, config=perceived)
             console.print(show(title, tables[name]))
             _animate(shown, folder / "animation.svg")
@@ -127,7 +127,7 @@ def examine(
 
 
 def _animate(shown: Sequence[Rollouts], path: Path) -> None:
-    """Write an animation of a case of the best variant."""
+    """Write an animation of a case of the best execution."""
     best = max(shown, key=lambda played: (played.success.mean(), played.throughput.mean()))
     case = _worth_watching(best)
     lifelong = len(best.goals[case]) > 1

@@ -133,7 +133,7 @@ class Execution:
 
     @property
     def name(self) -> str:
-        """Words that tell variants apart, as `parse` reads them: "argmax", "sampled,0.5,pibt"; no word means "idle"."""
+        """The execution in words that `parse` reads, such as "argmax" or "sampled,0.5,pibt"; no shield means "idle"."""
         words = [_WORD_OF_SAMPLE[self.sample]]
         if self.sample:
             words.append(f"{self.temperature:g}")
@@ -142,7 +142,7 @@ class Execution:
 
     @staticmethod
     def parse(text: str, base: Execution | None = None) -> Execution:
-        """Return the variant of the given name, its words in any order.
+        """Return the execution of the given name, its words in any order.
 
         Args:
             text: The words.
@@ -155,11 +155,11 @@ class Execution:
         for word in text.split(","):
             option, value = _OPTION_OF_WORD.get(word) or ("temperature", _number(word, text))
             if option in given:
-                raise ValueError(f"the variant {text!r} says {option} twice: {given[option]} and {value}")
+                raise ValueError(f"the execution {text!r} says {option} twice: {given[option]} and {value}")
             given[option] = value
         if "temperature" in given and not given.get("sample"):
             raise ValueError(
-                f"the variant {text!r} has a temperature but draws nothing: say sampled, stuck or fallback"
+                f"the execution {text!r} has a temperature but draws nothing: say sampled, stuck or fallback"
             )
         return replace(Execution() if base is None else base, **{"sample": False, **given})
 
@@ -180,7 +180,7 @@ def _number(word: str, text: str) -> float:
         return float(word)
     except ValueError:
         known = ", ".join(_OPTION_OF_WORD)
-        raise ValueError(f"unknown word {word!r} in the variant {text!r}: give {known} or a temperature") from None
+        raise ValueError(f"unknown word {word!r} in the execution {text!r}: give {known} or a temperature") from None
 
 
 def alarmed(stuck: Flags, edge_index: npt.NDArray[np.int64]) -> Flags:

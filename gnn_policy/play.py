@@ -37,15 +37,15 @@ class Command:
     POGEMA (.yaml), or a folder of these."""
     agents: int | None = None
     """How many robots: placed at random on a map, else the first ones of the file (all of them if not given)."""
-    run: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: general)")] = checkpoint.PACKAGED
+    policy: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: general)")] = checkpoint.PACKAGED
     """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     map: Path | None = None
     """The map of a scenario, if it does not lie beside it."""
     index: int | None = None
     """Which instance or map of a file, from 0; the first if not given."""
-    row: str | None = None
-    """How to execute the policy, in the words of the rows of `python -m gnn_policy.evaluate`; as its file says if not
-    given."""
+    execution: str | None = None
+    """How to execute the policy, written as for `--executions` of `python -m gnn_policy.evaluate`; if not given, the
+    execution saved with the policy."""
     task: Task = "one_shot"
     """"lifelong": a robot that arrives gets a new goal."""
     max_steps: int | None = None
@@ -78,9 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _play(command: Command) -> None:
     """Refuse what can be refused without torch, then play."""
     threads = cpu_threads(command.threads)
-    execution = checkpoint.executed_as(command.run)
-    if command.row is not None:
-        execution = Execution.parse(command.row, execution)
+    execution = checkpoint.executed_as(command.policy)
+    if command.execution is not None:
+        execution = Execution.parse(command.execution, execution)
     problems = _problems(command)
     if command.max_steps is None:
         steps = [_patience(instance) for instance in problems.values()]
@@ -95,7 +95,7 @@ def _play(command: Command) -> None:
     from gnn_policy.rollout import rollout
 
     torch.set_num_threads(threads)
-    policy = on_device(checkpoint.load(command.run, plugins=command.plugins), command.device)
+    policy = on_device(checkpoint.load(command.policy, plugins=command.plugins), command.device)
     console = Console()
     before = time.perf_counter()
     with console.status(f"{len(problems)} teams, {max(steps)} steps at most"):

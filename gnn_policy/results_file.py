@@ -14,7 +14,7 @@ from gnn_policy.execution import Execution, Sample
 from mapf_env.files import write_whole
 
 
-def variants_of(execution: Execution) -> list[Execution]:
+def default_executions(execution: Execution) -> list[Execution]:
     """Return the rows that are evaluated by default.
 
     They are argmax, draws of stuck robots and draws of all; for a policy whose stuck robots fall back on their shortest
@@ -25,13 +25,17 @@ def variants_of(execution: Execution) -> list[Execution]:
 
 
 def settings_of(
-    config: TrainConfig, num_agents: Sequence[int], variants: Sequence[Execution], split: Split, task: Task = "one_shot"
+    config: TrainConfig,
+    num_agents: Sequence[int],
+    executions: Sequence[Execution],
+    split: Split,
+    task: Task = "one_shot",
 ) -> dict[str, Any]:
     """Return everything that the numbers depend on, except for the policy."""
     maps, cases_per_map = config.size_of(split)
     names = ("height", "width", "density", "data_seed", "w", "timeout", "exam_nodes", "seed")
     return {
-        "variants": [variant.name for variant in variants],
+        "executions": [execution.name for execution in executions],
         "tables": list(tables_of(config, num_agents)),
         "split": split,
         "task": task,

@@ -16,7 +16,7 @@ from gnn_policy.command_line import run_command
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
 from gnn_policy.recipes import RECIPES, Recipe
-from gnn_policy.results_file import read_tables, settings_of, table_title, variants_of
+from gnn_policy.results_file import default_executions, read_tables, settings_of, table_title
 from gnn_policy.run_folder import RESULTS, check_run, is_finished
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def _start(command: Command) -> None:
 def _show_finished(folder: Path, config: TrainConfig) -> None:
     from gnn_policy.evaluation import lifelong_table, table
 
-    console, settings = Console(), settings_of(config, (), variants_of(config.execution), "test", config.task)
+    console, settings = Console(), settings_of(config, (), default_executions(config.execution), "test", config.task)
     show = table if config.task == "one_shot" else lifelong_table
     for name, result in read_tables(folder / RESULTS).items():
         console.print(show(table_title(name, settings), result))

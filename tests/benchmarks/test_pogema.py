@@ -329,7 +329,7 @@ def test_lacam_fails_where_it_has_no_plan_or_one_that_is_too_long() -> None:
         (["--methods", "lacam,soon"], "the option of lacam is a number of seconds"),
         (["--methods", "lacam,-1"], "lacam needs a positive number of seconds"),
         (["--methods", "n13"], "there is no checkpoint n13"),
-        (["--methods", "n4,quick"], "unknown word 'quick' in the variant 'quick'"),
+        (["--methods", "n4,quick"], "unknown word 'quick' in the execution 'quick'"),
         (["--methods", "n4", "n4,stuck"], "--methods has 'n4 stuck,1' twice"),
         (["--methods", "pibt", "--sets", "09-none"], "has no set '09-none': choose among 01-tiny"),
         (["--methods", "pibt", "--sizes", "0"], "--sizes must be at least 1, got 0"),

@@ -244,7 +244,7 @@ def own_file(tmp_path, monkeypatch, body, part="encoder"):
     return tmp_path / "evil.safetensors"
 
 
-COMMANDS = [(evaluate, ["evil.safetensors"]), (play, ["own.map", "--agents", "2", "--run", "evil.safetensors"])]
+COMMANDS = [(evaluate, ["evil.safetensors"]), (play, ["own.map", "--agents", "2", "--policy", "evil.safetensors"])]
 
 
 @pytest.mark.parametrize("part", ["encoder", "graph_layer"])
@@ -352,11 +352,11 @@ def test_newer_training_settings_stop_neither_play_nor_evaluation(file, tmp_path
     settings["policy"]["dilation"] = settings["execution"]["patience"] = 2  # pyright: ignore[reportArgumentType, reportCallIssue]
     with_metadata(file, training=tomli_w.dumps(settings))
     assert checkpoint.trained_with(file) == trained
-    play.main(["own.map", "--agents", "2", "--run", str(file), "--max-steps", "3"])
+    play.main(["own.map", "--agents", "2", "--policy", str(file), "--max-steps", "3"])
     settings["styles"], settings["height"] = ["forest"], "tall"
     with_metadata(file, training=tomli_w.dumps(settings))
     assert load(file).config == CONFIG
-    play.main(["own.map", "--agents", "2", "--run", str(file), "--max-steps", "3", "--out", "second.html"])
+    play.main(["own.map", "--agents", "2", "--policy", str(file), "--max-steps", "3", "--out", "second.html"])
     assert (tmp_path / "second.html").exists()
     with pytest.raises(checkpoint.CheckpointError, match="height"):
         checkpoint.trained_with(file)

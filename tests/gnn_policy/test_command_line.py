@@ -102,7 +102,7 @@ def test_a_device_that_cannot_compute_is_refused_before_any_work(device):
 def test_arguments_are_read_before_heavy_libraries_are_loaded(tmp_path, command, arguments):
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "map.map").write_text("type octile\nheight 1\nwidth 2\nmap\n..\n")
-    where = {"train": ["--run", "."], "evaluate": ["."], "play": ["map.map", "--agents", "1", "--run", "."]}[command]
+    where = {"train": ["--run", "."], "evaluate": ["."], "play": ["map.map", "--agents", "1", "--policy", "."]}[command]
     given = where if arguments == "refused folder" else [*arguments, *where[2 * (command == "train") :]]
     program = (
         "import sys, importlib\n"

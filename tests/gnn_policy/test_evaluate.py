@@ -29,7 +29,7 @@ CONFIG = TrainConfig(
 
 CHANGES = """
     --num-agents 2 5 --maps 2 --cases-per-map 3 --height 7 --width 8 --density 0.2 --styles walls --data-seed 9 --w 1.5
-    --timeout 4 --seed 6 --threads 1 --rows stuck,0.5 argmax,pibt,connected --failures 2
+    --timeout 4 --seed 6 --threads 1 --executions stuck,0.5 argmax,pibt,connected --failures 2
 """
 
 
@@ -65,20 +65,20 @@ def test_what_is_not_given_is_as_in_training(file, monkeypatch):
     assert config == CONFIG
     assert how["num_agents"] == ()
     assert how["split"] == "test"
-    assert how["variants"] == [Execution(), Execution(sample="stuck"), Execution(sample=True)]
+    assert how["executions"] == [Execution(), Execution(sample="stuck"), Execution(sample=True)]
     assert folder == file.parent / "evaluation"
 
 
 def test_rows_play_under_the_shield_that_the_policys_file_says(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    _, folder, how = examined(monkeypatch, "n12-informed", "--rows", "argmax", "stuck,idle")
-    assert how["variants"] == [Execution(shield="pibt"), Execution(sample="stuck")]
+    _, folder, how = examined(monkeypatch, "n12-informed", "--executions", "argmax", "stuck,idle")
+    assert how["executions"] == [Execution(shield="pibt"), Execution(sample="stuck")]
     assert str(folder) == "evaluation/n12-informed"
-    _, folder, how = examined(monkeypatch, "--rows", "argmax")
-    assert how["variants"] == [Execution(shield="pibt_swap", temperature=1.5)]
+    _, folder, how = examined(monkeypatch, "--executions", "argmax")
+    assert how["executions"] == [Execution(shield="pibt_swap", temperature=1.5)]
     assert str(folder) == "evaluation/general"
     _, _, how = examined(monkeypatch)
-    assert [each.sample for each in how["variants"]] == ["fallback", False]
+    assert [each.sample for each in how["executions"]] == ["fallback", False]
 
 
 @pytest.mark.parametrize("split", ["test", "validation"])
@@ -94,7 +94,7 @@ def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path, split
     )
     assert how == {
         "num_agents": (2, 5),
-        "variants": [Execution(sample="stuck", temperature=0.5), Execution(shield="pibt", comm_range="connected")],
+        "executions": [Execution(sample="stuck", temperature=0.5), Execution(shield="pibt", comm_range="connected")],
         "split": split,
         "task": "one_shot",
         "steps": 256,
@@ -124,22 +124,22 @@ def test_the_rows_of_a_policy_are_its_own_execution_drawn_in_three_ways(file, mo
     execution = Execution(sample=True, temperature=0.5, shield="pibt", comm_weights="distance")
     save(DecentralizedPolicy(CONFIG.policy, execution), file, training=CONFIG.to_toml())
     _, _, how = examined(monkeypatch, str(file))
-    assert how["variants"] == [replace(execution, sample=sample) for sample in (False, "stuck", True)]
-    _, _, how = examined(monkeypatch, str(file), "--rows", "stuck")
-    assert how["variants"] == [replace(execution, sample="stuck")]
-    _, _, how = examined(monkeypatch, str(file), "--rows", "stuck,1,idle,binary")
-    assert how["variants"] == [Execution(sample="stuck", comm_weights="binary")]
+    assert how["executions"] == [replace(execution, sample=sample) for sample in (False, "stuck", True)]
+    _, _, how = examined(monkeypatch, str(file), "--executions", "stuck")
+    assert how["executions"] == [replace(execution, sample="stuck")]
+    _, _, how = examined(monkeypatch, str(file), "--executions", "stuck,1,idle,binary")
+    assert how["executions"] == [Execution(sample="stuck", comm_weights="binary")]
 
 
 def test_families_of_training_have_a_table_each_unless_a_map_is_asked_for(file, monkeypatch, capsys):
     save(DecentralizedPolicy(CONFIG.policy), file, training=replace(CONFIG, families=MIXED.families).to_toml())
-    evaluate.main([str(file), "--threads", "1", "--rows", "argmax"])
+    evaluate.main([str(file), "--threads", "1", "--executions", "argmax"])
     folder = file.parent / "evaluation"
     results = json.loads((folder / "results.json").read_text())
     assert list(results["tables"]) == ["2 to 5 robots, family 1 (cells)", "3 to 4 robots, family 2 (maze)"]
     shown = capsys.readouterr().out
     assert all(f"{title}, 3 test maps" in shown for title in results["tables"])
-    evaluate.main([str(file), "--rows", "argmax", "--num-agents", "2", "4", "--out", str(file.parent / "sizes")])
+    evaluate.main([str(file), "--executions", "argmax", "--num-agents", "2", "4", "--out", str(file.parent / "sizes")])
     sized = json.loads((file.parent / "sizes" / "results.json").read_text())
     assert list(sized["tables"]) == [
         f"{N} robots, family {family}" for family in ("1 (cells)", "2 (maze)") for N in (2, 4)
@@ -152,9 +152,9 @@ def test_evaluations_of_other_families_are_not_mixed_up(file, capsys):
     for number, families in enumerate((MIXED.families, (replace(MIXED.families[0], density=(0.3, 0.3)),))):
         save(DecentralizedPolicy(CONFIG.policy), file, training=replace(CONFIG, families=families).to_toml())
         if not number:
-            evaluate.main([str(file), "--threads", "1", "--rows", "argmax"])
+            evaluate.main([str(file), "--threads", "1", "--executions", "argmax"])
     with pytest.raises(SystemExit):
-        evaluate.main([str(file), "--threads", "1", "--rows", "argmax"])
+        evaluate.main([str(file), "--threads", "1", "--executions", "argmax"])
     assert "other settings (" in capsys.readouterr().err
 
 
@@ -221,7 +221,7 @@ def test_evaluation_loads_neither_the_training_loop_nor_torchrl(file):
     ("changed", "named"),
     [
         ("--styles walls", "styles"),
-        ("--rows argmax", "variants"),
+        ("--executions argmax", "executions"),
         ("--num-agents 2", "tables"),
         ("--split validation --maps 3 --cases-per-map 2", "split"),
         ("--maps 2 --seed 9", "maps, seed"),
@@ -267,9 +267,9 @@ def test_results_of_another_policy_or_another_program_are_not_overwritten(file, 
         "--maps 0",
         "--timeout 0",
         "--timeout -1",
-        "--rows sampled,0",
-        "--rows argmax guess",
-        "--rows",
+        "--executions sampled,0",
+        "--executions argmax guess",
+        "--executions",
         "--w 0.9",
         "--density 0.99",
         "--num-agents 99",

@@ -142,7 +142,7 @@ def test_which_cases_the_expert_solves_is_no_matter_of_time(monkeypatch):
     assert 0 < asked[0]["node_limit"] < math.inf
 
 
-VARIANTS = [
+EXECUTIONS = [
     Execution(),
     Execution(sample=True, temperature=2.0),
     Execution(sample="stuck", shield="pibt", comm_range="connected", comm_weights="distance"),
@@ -157,21 +157,21 @@ def compared():
     cases = make_cases("test", seed=0, maps=5, cases_per_map=3, families=[family]).instances
     exam = Exam.prepare(cases, w=1.05, timeout=3.0, threads=1)
     phases = []
-    rows, played = evaluation.compare(exam, policy, VARIANTS, seed=3, progress=phases.append)
+    rows, played = evaluation.compare(exam, policy, EXECUTIONS, seed=3, progress=phases.append)
     return exam, policy, rows, played, phases
 
 
 def test_the_comparison_has_a_row_for_each_variant_and_competitor(compared):
     exam, policy, rows, played, phases = compared
     competitors = ["random", "greedy*", "greedy,stuck*", "PIBT*", "expert*"]
-    assert [row.name for row in rows] == [each.name for each in VARIANTS] + competitors
+    assert [row.name for row in rows] == [each.name for each in EXECUTIONS] + competitors
     assert list(evaluation.BASELINES) == competitors
     assert phases == [row.name for row in rows[:-1]]  # the expert's row is there before
     assert phases == [row.name for row in rows[:-1]]  # the expert's row is there before
     settings = {"seed": 3, "max_steps": exam.max_steps}
-    for variant, row, seen in zip(VARIANTS, rows, played, strict=False):
-        again = rollout(policy, exam.instances, execution=variant, **settings)
-        assert row == evaluation.score(variant.name, exam, again)
+    for execution, row, seen in zip(EXECUTIONS, rows, played, strict=False):
+        again = rollout(policy, exam.instances, execution=execution, **settings)
+        assert row == evaluation.score(execution.name, exam, again)
         assert np.array_equal(seen.flowtime, again.flowtime)
     actors = [RandomActor(), GreedyActor(), GreedyActor(random_when_stuck=True)]
     for actor, row in zip(actors, rows[3:6], strict=True):
@@ -181,7 +181,7 @@ def test_the_comparison_has_a_row_for_each_variant_and_competitor(compared):
 def test_a_policy_that_sees_the_cost_to_go_is_marked_as_one_that_knows_the_map(compared):
     exam = compared[0]
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2, extra_channels=("cost_to_go",)))
-    rows, _ = evaluation.compare(exam, policy, VARIANTS[:1])
+    rows, _ = evaluation.compare(exam, policy, EXECUTIONS[:1])
     assert rows[0].name == "argmax*"
 
 
@@ -224,7 +224,7 @@ def test_the_table_shows_every_figure_within_eighty_columns(compared):
     text = shown.getvalue()
     assert "…" not in text
     for row in rows:
-        assert row.name in text or row.name == VARIANTS[2].name
+        assert row.name in text or row.name == EXECUTIONS[2].name
         assert f"{row.success_rate.mean:.3f}" in text
         assert f"[{row.success_rate.low:.3f}, {row.success_rate.high:.3f}]" in text
         assert f"{row.flowtime_increase.mean:+.1%}" in text
@@ -240,18 +240,18 @@ def test_a_lifelong_comparison_is_the_throughput_of_every_row(compared):
     exam, policy, _, _, _ = compared
     phases = []
     table, played = evaluation.compare_lifelong(
-        exam.instances, policy, VARIANTS, steps=30, seed=3, progress=phases.append
+        exam.instances, policy, EXECUTIONS, steps=30, seed=3, progress=phases.append
     )
-    names = [*(each.name for each in VARIANTS), "random", "greedy*", "PIBT*"]
+    names = [*(each.name for each in EXECUTIONS), "random", "greedy*", "PIBT*"]
     assert [row["name"] for row in table["rows"]] == phases == names
     assert (table["cases"], table["steps"]) == (len(exam.instances), 30)
-    players = [*((policy, each) for each in VARIANTS), *((each, None) for each in LIFELONG_BASELINES.values())]
+    players = [*((policy, each) for each in EXECUTIONS), *((each, None) for each in LIFELONG_BASELINES.values())]
     for row, (player, execution) in zip(table["rows"], players, strict=True):
         again = rollout(player, exam.instances, task="lifelong", execution=execution, seed=3, max_steps=30)
         assert row["throughput"]["mean"] == again.throughput.mean()
         assert all(len(each.paths) == 31 for each in again.solutions), "a lifelong team never ends before"
-    for variant, seen in zip(VARIANTS, played, strict=True):
-        again = rollout(policy, exam.instances, task="lifelong", execution=variant, seed=3, max_steps=30)
+    for execution, seen in zip(EXECUTIONS, played, strict=True):
+        again = rollout(policy, exam.instances, task="lifelong", execution=execution, seed=3, max_steps=30)
         assert np.array_equal(seen.throughput, again.throughput)
     assert json.loads(json.dumps(table, allow_nan=False)) == table
     shown = io.StringIO()

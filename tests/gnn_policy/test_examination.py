@@ -68,7 +68,7 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
     ]
     assert numbers["settings"] == {
         "policy": fingerprint(policy),
-        "variants": ["argmax", "stuck,1", "sampled,1"],
+        "executions": ["argmax", "stuck,1", "sampled,1"],
         "tables": ["2"],
         "split": "test",
         "task": "one_shot",

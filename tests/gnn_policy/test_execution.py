@@ -13,7 +13,7 @@ from gnn_policy import PolicyConfig
 from gnn_policy.execution import Execution, alarmed, gumbel, robot_seeds, uniform
 from mapf_env import HISTORY, BatchedEnv, EnvConfig, Instance, Senses
 
-VARIANTS = st.builds(
+EXECUTIONS = st.builds(
     Execution,
     sample=st.sampled_from([False, True, "stuck", "fallback"]),
     temperature=st.sampled_from([0.3, 1.0, 2.5]),
@@ -23,14 +23,14 @@ VARIANTS = st.builds(
 )
 
 
-@given(VARIANTS, st.randoms())
-def test_names_round_trip_with_their_words_in_any_order(variant, random):
-    words = variant.name.split(",")
+@given(EXECUTIONS, st.randoms())
+def test_names_round_trip_with_their_words_in_any_order(execution, random):
+    words = execution.name.split(",")
     random.shuffle(words)
     again = Execution.parse(",".join(words))
-    assert again.name == variant.name
-    if variant.sample:
-        assert again == variant
+    assert again.name == execution.name
+    if execution.sample:
+        assert again == execution
 
 
 def test_a_name_without_a_shield_has_the_one_that_is_given():
@@ -48,8 +48,8 @@ def test_different_variants_have_different_names():
     )
     fields = ("sample", "temperature", "shield", "comm_range", "comm_weights")
     settings: list[dict[str, Any]] = [dict(zip(fields, each, strict=True)) for each in choices]
-    variants = [Execution(**each) for each in settings]
-    assert len({each.name for each in variants if each.sample}) == 3 * 2 * 3 * 9
+    executions = [Execution(**each) for each in settings]
+    assert len({each.name for each in executions if each.sample}) == 3 * 2 * 3 * 9
     assert Execution().name == "argmax"
     assert Execution(sample=True, temperature=0.5, shield="pibt").name == "sampled,0.5,pibt"
 

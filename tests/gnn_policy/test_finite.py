@@ -127,7 +127,7 @@ def test_no_call_takes_weights_that_are_not_finite(policy, tmp_path, capsys, nam
     with pytest.raises(checkpoint.CheckpointError, match=rf"bad\.safetensors: .*not finite .*{name}"):
         load(file)
     save_map("own.map", np.zeros((4, 4), bool))
-    for command, arguments in ((play, ["own.map", "--agents", "2", "--run", str(file)]), (evaluate, [str(file)])):
+    for command, arguments in ((play, ["own.map", "--agents", "2", "--policy", str(file)]), (evaluate, [str(file)])):
         with pytest.raises(SystemExit) as end:
             command.main(arguments)
         assert end.value.code == 2

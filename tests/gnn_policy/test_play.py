@@ -12,7 +12,7 @@ import oracles
 from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, play, rollout, save
 from mapf_env import load_scen, random_instance, save_instances, save_map, save_scen
 
-LIFELONG = ["--task", "lifelong", "--row", "argmax", "--max-steps", "9"]
+LIFELONG = ["--task", "lifelong", "--execution", "argmax", "--max-steps", "9"]
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def home(tmp_path, monkeypatch):
 
 
 def played(*arguments):
-    play.main([*arguments, "--run", "policy.safetensors", "--threads", "1"])
+    play.main([*arguments, "--policy", "policy.safetensors", "--threads", "1"])
 
 
 def shown(path):
@@ -80,7 +80,7 @@ def test_every_option_reaches_the_rollout(home, monkeypatch):
     monkeypatch.setattr(
         sys.modules["gnn_policy.rollout"], "rollout", lambda *given, **how: asked.append(how) or rollout(*given, **how)
     )
-    for options in ([], ["--row", "argmax"], ["--row", "sampled,0.5,pibt", "--max-steps", "7"], LIFELONG):
+    for options in ([], ["--execution", "argmax"], ["--execution", "sampled,0.5,pibt", "--max-steps", "7"], LIFELONG):
         played("own.scen", "--seed", "3", *options)
     instance = load_scen("own.scen")
     longest = max(
@@ -102,11 +102,11 @@ def test_a_policy_plays_as_its_file_says(home, monkeypatch):
         "rollout",
         lambda *given, **how: asked.append(how["execution"]) or rollout(*given, **how),
     )
-    for run in ("n12-informed", "n12"):
-        play.main(["own.scen", "--run", run, "--threads", "1"])
+    for policy in ("n12-informed", "n12"):
+        play.main(["own.scen", "--policy", policy, "--threads", "1"])
     assert asked == [Execution(sample="stuck", shield="pibt"), Execution(sample="stuck")]
-    play.main(["own.scen", "--run", "n12-informed", "--row", "argmax", "--threads", "1"])
-    assert asked[-1] == Execution(shield="pibt"), "a row keeps the shield of the file unless it names one"
+    play.main(["own.scen", "--policy", "n12-informed", "--execution", "argmax", "--threads", "1"])
+    assert asked[-1] == Execution(shield="pibt"), "an execution keeps the shield of the file unless it names one"
 
 
 def test_a_lifelong_team_goes_on_to_the_last_step_and_its_arrivals_are_reported(home, capsys):
@@ -149,7 +149,7 @@ def test_a_team_that_is_home_has_solved_it(home, capsys):
         ("own.map --agents 3 --threads -1", "threads"),
         ("own.map --agents 3 --device abacus", "abacus"),
         ("own.scen --map elsewhere", "elsewhere"),
-        ("own.map --agents 3 --row best", "unknown word 'best'"),
+        ("own.map --agents 3 --execution best", "unknown word 'best'"),
         ("own.map --agents 3 --out none/page.html", "none/page.html cannot be written: make the folder"),
         ("own.map --agents 3 --out elsewhere", "elsewhere is a folder"),
         ("own.map --agents 3 --out own.map", "own.map would overwrite the input own.map"),
@@ -158,12 +158,12 @@ def test_a_team_that_is_home_has_solved_it(home, capsys):
         ("none.scen", "none.scen"),
         ("elsewhere --agents 3 --map own.map", "go with one file"),
         ("policy.safetensors --agents 3", "must be a map"),
-        ("own.scen --run none", "none"),
+        ("own.scen --policy none", "none"),
     ],
 )
 def test_a_mistake_takes_one_line(home, capsys, wrong, words):
     with pytest.raises(SystemExit) as end:
-        play.main(["--run", "policy.safetensors", *wrong.split()])
+        play.main(["--policy", "policy.safetensors", *wrong.split()])
     assert end.value.code == 2
     told = capsys.readouterr().err
     assert told.startswith("error: ")
