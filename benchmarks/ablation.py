@@ -26,8 +26,8 @@ from rich.console import Console
 import experts
 from gnn_policy.command_line import run_command
 from gnn_policy.config import TrainConfig
-from gnn_policy.evaluation import Estimate, Exam
 from gnn_policy.execution import Execution
+from gnn_policy.metrics import Estimate, ReferenceSet
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.recipes import RECIPES
 from gnn_policy.rollout import rollout
@@ -139,13 +139,13 @@ def train(options: Options, name: str, config: TrainConfig, console: Console) ->
     training = Training(config, folder, progress, clock=time.process_time)
     with progress:
         training.run()
-    exam = the_exam()
-    played = rollout(training.policy, exam.instances, execution=Execution(), max_steps=exam.max_steps)
+    reference = reference_set()
+    played = rollout(training.policy, reference.instances, execution=Execution(), max_steps=reference.max_steps)
     spent = np.cumsum([row.collect_seconds + row.fit_seconds for row in training.history])
     rows = training.history
     result = {
         "success": played.success.astype(int).tolist(),
-        "flowtime_increase": float(exam.increase(played.flowtime).mean()),
+        "flowtime_increase": float(reference.increase(played.flowtime).mean()),
         "accuracy": rows[-1].accuracy,
         "states": rows[-1].demonstrations,
         "unlabelled": sum(row.unlabelled for row in rows),
@@ -200,9 +200,9 @@ def expected_minutes(options: Options, variants: Variants) -> float:
 
 
 @functools.cache
-def the_exam() -> Exam:
+def reference_set() -> ReferenceSet:
     """The same validation cases and time limits for all, whatever taught."""
-    return Exam.prepare(BASE.cases("validation").instances, w=BASE.w, timeout=BASE.timeout, threads=1)
+    return ReferenceSet.prepare(BASE.cases("validation").instances, w=BASE.w, timeout=BASE.timeout, threads=1)
 
 
 class TeacherActor:
@@ -236,14 +236,14 @@ def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
     """How good the labels of each variant are when they are followed from step to step."""
     file = runs / "quality.json"
     known: dict[str, dict[str, float]] = json.loads(file.read_text()) if file.exists() else {}
-    exam = the_exam()
-    bounds = np.array([each.lower_bound for each in experts.solve_many(exam.instances, w=1.0)])
+    reference = reference_set()
+    bounds = np.array([each.lower_bound for each in experts.solve_many(reference.instances, w=1.0)])
     for name, settings in LABELS.items():
         if name in known:
             continue
         console.print(f"quality of labels: {name}")
         config = replace(BASE, **settings)
-        grids = list({each.grid.tobytes(): each.grid for each in exam.instances}.values())
+        grids = list({each.grid.tobytes(): each.grid for each in reference.instances}.values())
         teacher = Teacher(
             grids,
             solver=config.teacher,
@@ -254,7 +254,7 @@ def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
             clock=time.process_time,
         )
         actor = TeacherActor(teacher, grids)
-        played = rollout(actor, exam.instances, max_steps=exam.max_steps)
+        played = rollout(actor, reference.instances, max_steps=reference.max_steps)
         solved = played.success
         known[name] = {
             "solved": float(solved.mean()),

@@ -25,8 +25,8 @@ from gnn_policy import checkpoint
 from gnn_policy.baselines import GreedyActor
 from gnn_policy.cases import Family, make_cases
 from gnn_policy.command_line import run_command
-from gnn_policy.evaluation import Estimate
 from gnn_policy.execution import Execution
+from gnn_policy.metrics import Estimate
 from gnn_policy.rollout import Actor, PolicyActor, rollout
 from mapf_env import Instance
 

@@ -25,7 +25,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from gnn_policy import checkpoint, evaluation
+from gnn_policy import checkpoint, metrics
 from gnn_policy.acting import tensors
 from gnn_policy.command_line import run_command
 from gnn_policy.failures import Failure, count_failures
@@ -89,7 +89,7 @@ def test(experiment: Experiment, console: Console) -> None:
         task = progress.add_task("", total=sum(map(len, todo.values())))
         for scene, models in todo.items():
             progress.update(task, description=f"{scene.name}: expert")
-            exam = _exam(experiment, scene)
+            reference = _reference_set(experiment, scene)
             for model in models:
                 path = experiment.result(scene, _name(model))
                 if path.exists():  # another process was faster
@@ -97,13 +97,13 @@ def test(experiment: Experiment, console: Console) -> None:
                     continue
                 progress.update(task, description=f"{scene.name}: {_name(model)}")
                 rows, failures = (
-                    (evaluation.baselines(exam), {})
+                    (metrics.baselines(reference), {})
                     if model is None
-                    else _play(experiment, scene, model, policies[model], exam)
+                    else _play(experiment, scene, model, policies[model], reference)
                 )
                 result = {
                     "settings": _settings(experiment, scene, model, policies),
-                    **evaluation.as_json(rows, exam),
+                    **metrics.as_json(rows, reference),
                     "failures": failures,
                 }
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -151,7 +151,7 @@ def _name(model: Model | None) -> str:
     return model.name if model else "baselines"
 
 
-def _exam(experiment: Experiment, scene: Scene) -> evaluation.Exam:
+def _reference_set(experiment: Experiment, scene: Scene) -> metrics.ReferenceSet:
     config = replace(
         RECIPES["full"],
         styles=(scene.style,),
@@ -160,20 +160,20 @@ def _exam(experiment: Experiment, scene: Scene) -> evaluation.Exam:
         num_agents=scene.num_agents,
         cases_per_map=experiment.cases_per_map(scene),
     )
-    return evaluation.Exam.prepare(
+    return metrics.ReferenceSet.prepare(
         config.cases("test").instances, w=W, timeout=config.timeout, threads=experiment.threads
     )
 
 
 def _play(
-    experiment: Experiment, scene: Scene, model: Model, policy: DecentralizedPolicy, exam: evaluation.Exam
-) -> tuple[list[evaluation.Score], dict[str, dict[Failure, int]]]:
+    experiment: Experiment, scene: Scene, model: Model, policy: DecentralizedPolicy, reference: metrics.ReferenceSet
+) -> tuple[list[metrics.Score], dict[str, dict[Failure, int]]]:
     """A row for each way to execute the model, and how its teams failed."""
     rows, failures = [], {}
     for execution in experiment.executions(model, model.trained_for(scene)):
         with autocast(experiment.options.precision, torch.device("cpu")):
-            played = rollout(policy, exam.instances, execution=execution, max_steps=exam.max_steps)
-        rows.append(evaluation.score(execution.name, exam, played))
+            played = rollout(policy, reference.instances, execution=execution, max_steps=reference.max_steps)
+        rows.append(metrics.score(execution.name, reference, played))
         failures[execution.name] = count_failures(played)
     return rows, failures
 

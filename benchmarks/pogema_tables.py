@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich import box
 from rich.table import Table
 
-from gnn_policy.evaluation import Estimate
+from gnn_policy.metrics import Estimate
 from mapf_env.files import replacing
 from pogema_cases import Published
 

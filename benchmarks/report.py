@@ -67,8 +67,8 @@ class Run:
     metrics: list[dict[str, str]]
     """A row for each round."""
     results: dict[str, Any]
-    """Tables by the number of robots; empty if the run was not examined."""
-    exam: str
+    """Tables by the number of robots; empty if the run was not evaluated."""
+    tested_on: str
     """What the tables were measured on."""
     failures: str | None
     """The page of the worst cases."""
@@ -93,7 +93,9 @@ class Run:
             TrainConfig.load(folder / "config.toml").num_agents,
             list(csv.DictReader(io.StringIO(metrics.read_text(encoding="utf-8")))) if metrics.is_file() else [],
             tested or found.get("tables", {}),
-            "benchmarks/paper.py: test maps of independent cells, w = 1.05" if tested else _exam(found.get("settings")),
+            "benchmarks/paper.py: test maps of independent cells, w = 1.05"
+            if tested
+            else _tested_on(found.get("settings")),
             page.read_text(encoding="utf-8") if page.is_file() else None,
         )
 
@@ -109,9 +111,9 @@ class Run:
                     yield int(size), found[measure]["mean"]
 
 
-def _exam(settings: dict[str, Any] | None) -> str:
+def _tested_on(settings: dict[str, Any] | None) -> str:
     if not settings:
-        return "not examined"
+        return "not evaluated"
     styles, size = " and ".join(settings["styles"]), f"{settings['height']} x {settings['width']}"
     maps = f"{settings['maps']} {settings['split']} maps of {styles}, {size}, {settings['cases_per_map']} cases each"
     return f"{maps}, w = {settings['w']}, T_max {settings['timeout']} makespans"
@@ -132,24 +134,27 @@ def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
     ]
     if any(run.metrics for run in runs):
         parts += ["<h2>Learning curves</h2>", curves([run for run in runs if run.metrics])]
-    examined = [run for run in runs if run.results]
+    evaluated = [run for run in runs if run.results]
     parts += [
-        f"<p>{escape(run.name)} is not examined yet; <code>python -m gnn_policy.evaluate RUN --num-agents 4 6 8 10 12 "
+        f"<p>{escape(run.name)} is not evaluated yet; <code>python -m gnn_policy.evaluate RUN --num-agents 4 6 8 10 12 "
         "14 --failures 5</code> does it.</p>"
         for run in runs
         if not run.results
     ]
-    if examined:
-        exams = {run.exam: ", ".join(each.name for each in examined if each.exam == run.exam) for run in examined}
+    if evaluated:
+        tested_on = {
+            run.tested_on: ", ".join(each.name for each in evaluated if each.tested_on == run.tested_on)
+            for run in evaluated
+        }
         parts += [
-            "<h2>What was examined</h2>",
-            *(f"<p>{escape(who)}: {escape(exam)}</p>" for exam, who in exams.items()),
+            "<h2>What was evaluated</h2>",
+            *(f"<p>{escape(who)}: {escape(tested_on)}</p>" for tested_on, who in tested_on.items()),
         ]
-        parts += ["<h2>Success and flowtime against the number of robots</h2>", against_robots(examined)]
-        parts += ["<h2>Success beside the paper's</h2>", heat_maps(examined)]
+        parts += ["<h2>Success and flowtime against the number of robots</h2>", against_robots(evaluated)]
+        parts += ["<h2>Success beside the paper's</h2>", heat_maps(evaluated)]
         kinds = "".join(f"<li><b>{kind}</b>: {meaning}</li>" for kind, meaning in MEANINGS.items())
-        parts += ["<h2>Why teams failed</h2>", f"<ul>{kinds}</ul>", failures(examined)]
-    for run in examined:
+        parts += ["<h2>Why teams failed</h2>", f"<ul>{kinds}</ul>", failures(evaluated)]
+    for run in evaluated:
         if run.failures is not None:
             parts.append(
                 f"<h3>{escape(run.name)}: the worst of each kind, by python -m gnn_policy.evaluate</h3>"

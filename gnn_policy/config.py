@@ -67,7 +67,7 @@ class TrainConfig:
     """Cases on each validation map."""
     timeout: float = 3.0
     """T_max in makespans of the expert's solution."""
-    exam_nodes: int = 200_000
+    reference_nodes: int = 200_000
     """Nodes that ECBS may generate for a validation or test case before LaCAM plans it; take fewer for crowds."""
 
     teacher: str = "ecbs"
@@ -168,8 +168,9 @@ class TrainConfig:
         check_types(self)
         positive = (
             "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
-            "exam_nodes expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window rollout_length "
-            "rollout_teams plan_steps hard_case_mining collectors lr final_lr validate_every expert_rounds stuck_weight"
+            "reference_nodes expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window "
+            "rollout_length rollout_teams plan_steps hard_case_mining collectors lr final_lr validate_every "
+            "expert_rounds stuck_weight"
         )
         for name in positive.split():
             if not 0 < getattr(self, name) < math.inf:

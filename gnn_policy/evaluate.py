@@ -1,4 +1,4 @@
-"""`python -m gnn_policy.evaluate POLICY`: examine any policy on held-out maps."""
+"""`python -m gnn_policy.evaluate POLICY`: evaluate any policy on held-out maps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mapf_env.generation import MapStyle
 
 @dataclass(frozen=True)
 class Command:
-    """Examine a policy beside the expert and baselines that learn nothing, on the same held-out cases.
+    """Evaluate a policy next to the expert and baselines that learn nothing, on the same held-out cases.
 
     What is not given is as the policy was trained. Results of other settings are never overwritten.
     """
@@ -128,12 +128,12 @@ def _evaluate(command: Command) -> None:
     import torch
 
     from gnn_policy.command_line import on_device
-    from gnn_policy.examination import examine
+    from gnn_policy.evaluation_report import evaluate_and_report
 
     torch.set_num_threads(threads)
     policy = on_device(checkpoint.load(command.policy, plugins=command.plugins), command.device)
     folder.mkdir(parents=True, exist_ok=True)
-    examine(
+    evaluate_and_report(
         policy,
         config,
         folder,

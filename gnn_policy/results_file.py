@@ -33,7 +33,7 @@ def settings_of(
 ) -> dict[str, Any]:
     """Return everything that the numbers depend on, except for the policy."""
     maps, cases_per_map = config.size_of(split)
-    names = ("height", "width", "density", "data_seed", "w", "timeout", "exam_nodes", "seed")
+    names = ("height", "width", "density", "data_seed", "w", "timeout", "reference_nodes", "seed")
     return {
         "executions": [execution.name for execution in executions],
         "tables": list(tables_of(config, num_agents)),

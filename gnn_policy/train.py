@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Command:
-    """Train a decentralized policy by imitating an ECBS expert, then examine it on held-out maps.
+    """Train a decentralized policy by imitating an ECBS expert, then evaluate it on held-out maps.
 
     A killed run goes on where it stopped when the same command is given again. Several processes share the work, on one
     machine or more, when torchrun starts them: `torchrun --nproc-per-node 2 -m gnn_policy.train -- --run runs/two`.
@@ -108,7 +108,7 @@ def _start(command: Command) -> None:
 
 
 def _show_finished(folder: Path, config: TrainConfig) -> None:
-    from gnn_policy.evaluation import lifelong_table, table
+    from gnn_policy.metrics import lifelong_table, table
 
     console, settings = Console(), settings_of(config, (), default_executions(config.execution), "test", config.task)
     show = table if config.task == "one_shot" else lifelong_table
@@ -123,7 +123,7 @@ def _show_finished(folder: Path, config: TrainConfig) -> None:
 
 def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) -> None:
     from gnn_policy.command_line import on_device
-    from gnn_policy.examination import examine
+    from gnn_policy.evaluation_report import evaluate_and_report
     from gnn_policy.progress import TrainingProgress
     from gnn_policy.training import Training
 
@@ -143,7 +143,9 @@ def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) ->
             return
         # The command line, which the run's settings agree with, has asked for its parts.
         policy = checkpoint.load(folder, plugins=tuple(config.policy.plugins.values()))
-        examine(on_device(policy, config.device), config, folder, console, task=config.task, threads=training.threads)
+        evaluate_and_report(
+            on_device(policy, config.device), config, folder, console, task=config.task, threads=training.threads
+        )
     console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
     console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)
 

@@ -34,7 +34,7 @@ from tensordict import TensorDict
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
-from gnn_policy import checkpoint, evaluation
+from gnn_policy import checkpoint, metrics
 from gnn_policy.command_line import on_device
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
@@ -144,7 +144,7 @@ class Training:
     def run(self) -> None:
         """Train all remaining rounds."""
         config, first = self.config, self.ranks.rank == 0
-        exam = self._exam() if first else None
+        reference = self._reference_set() if first else None
         batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
         demonstrator = Demonstrator(config, self._player, self._teacher, self._cases, self.ranks)
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
@@ -152,7 +152,7 @@ class Training:
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
             for number in range(len(self.history), config.epochs):
-                row = self._round(number, demonstrator, batches, exam)
+                row = self._round(number, demonstrator, batches, reference)
                 self.history.append(row)
                 if writer is not None:
                     for name, value in asdict(row).items():
@@ -172,16 +172,16 @@ class Training:
                 writer.close()
                 self._lock.release()
 
-    def _exam(self) -> evaluation.Exam:
+    def _reference_set(self) -> metrics.ReferenceSet:
         config = self.config
         if config.task == "lifelong":
-            return evaluation.Exam.without_expert(self._validation, evaluation.LIFELONG_STEPS)
-        return evaluation.Exam.prepare(
-            self._validation, w=config.w, timeout=config.timeout, threads=self.threads, nodes=config.exam_nodes
+            return metrics.ReferenceSet.without_expert(self._validation, metrics.LIFELONG_STEPS)
+        return metrics.ReferenceSet.prepare(
+            self._validation, w=config.w, timeout=config.timeout, threads=self.threads, nodes=config.reference_nodes
         )
 
     def _round(
-        self, number: int, demonstrator: Demonstrator, batches: BatchMaker, exam: evaluation.Exam | None
+        self, number: int, demonstrator: Demonstrator, batches: BatchMaker, reference: metrics.ReferenceSet | None
     ) -> Round:
         config = self.config
         began, taught, unlabelled = self._clock(), self._teacher.seconds, 0
@@ -224,9 +224,9 @@ class Training:
             demonstrations=len(demonstrations),
             unlabelled=unlabelled,
         )
-        if exam is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.epochs):
+        if reference is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.epochs):
             self.progress.phase(number, "validation")
-            self._validate(row, exam)
+            self._validate(row, reference)
         row.seconds = self._seconds_before + self._clock() - self._began
         return row
 
@@ -334,19 +334,19 @@ class Training:
         own = batch[self.ranks.rank :: self.ranks.count]
         return np.array_split(own, parts if len(own) >= 4 else 1)
 
-    def _validate(self, row: Round, exam: evaluation.Exam) -> None:
+    def _validate(self, row: Round, reference: metrics.ReferenceSet) -> None:
         played = rollout(
             self._player,
-            exam.instances,
+            reference.instances,
             task=self.config.task,
             execution=self.config.rollout_execution,
-            max_steps=exam.max_steps,
+            max_steps=reference.max_steps,
             seed=self.config.seed,
         )
         if self.config.task == "lifelong":
             row.validation_throughput = float(played.throughput.mean())
         else:
-            result = evaluation.score("validation", exam, played)
+            result = metrics.score("validation", reference, played)
             row.validation_success = result.success_rate.mean
             row.validation_flowtime_increase = result.flowtime_increase.mean
         best = [each for each in self.history if each.validation is not None]

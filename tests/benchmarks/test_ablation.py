@@ -34,7 +34,7 @@ def ablation(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         batch_size=4,
     )
     monkeypatch.setattr(script, "BASE", tiny)
-    script.the_exam.cache_clear()
+    script.reference_set.cache_clear()
     return script
 
 

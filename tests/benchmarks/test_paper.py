@@ -168,12 +168,12 @@ def test_a_pair_that_another_process_tested_meanwhile_is_left_as_it_is(tmp_path,
     path = whole.result(Scene("cells", 4), "n4-k3")
     baselines = whole.result(Scene("cells", 4), "baselines")
 
-    def tested_by_another(exam):
+    def tested_by_another(reference):
         path.write_text("another's")
         return []
 
     path.parent.mkdir(parents=True)
-    monkeypatch.setattr(paper.evaluation, "baselines", tested_by_another)
+    monkeypatch.setattr(paper.metrics, "baselines", tested_by_another)
     paper.test(whole, Console(quiet=True))
     assert baselines.exists()
     assert path.read_text() == "another's"

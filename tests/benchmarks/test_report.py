@@ -84,7 +84,7 @@ def test_a_model_of_the_papers_experiment_shows_what_it_was_tested_on(run: Path,
     assert "<!-- .866 -->" not in page, "what the evaluation of ten robots found"
 
 
-def test_a_run_that_was_not_examined_has_its_curves(run: Path, tmp_path: Path) -> None:
+def test_a_run_that_was_not_evaluated_has_its_curves(run: Path, tmp_path: Path) -> None:
     (run / "evaluation" / "results.json").unlink()
     assert report(run, "--out", "other.html", folder=tmp_path).returncode == 0
     assert (tmp_path / "other.html").read_text(encoding="utf-8").count("<svg") == 2

@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, evaluation, examination, save
+from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, evaluation_report, metrics, save
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 from mapf_env import random_instance, save_instances
@@ -40,11 +40,13 @@ def file(tmp_path):
     return tmp_path / "policy.safetensors"
 
 
-def examined(monkeypatch, *arguments):
-    """What the command would examine, and how."""
+def evaluated(monkeypatch, *arguments):
+    """What the command would evaluate, and how."""
     calls = []
     monkeypatch.setattr(
-        examination, "examine", lambda policy, config, folder, console, **how: calls.append((config, folder, how))
+        evaluation_report,
+        "evaluate_and_report",
+        lambda policy, config, folder, console, **how: calls.append((config, folder, how)),
     )
     evaluate.main(list(arguments))
     return calls[0]
@@ -61,7 +63,7 @@ def test_the_help_names_every_option(capsys, monkeypatch):
 
 
 def test_what_is_not_given_is_as_in_training(file, monkeypatch):
-    config, folder, how = examined(monkeypatch, str(file))
+    config, folder, how = evaluated(monkeypatch, str(file))
     assert config == CONFIG
     assert how["num_agents"] == ()
     assert how["split"] == "test"
@@ -71,19 +73,19 @@ def test_what_is_not_given_is_as_in_training(file, monkeypatch):
 
 def test_rows_play_under_the_shield_that_the_policys_file_says(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    _, folder, how = examined(monkeypatch, "n12-informed", "--executions", "argmax", "stuck,idle")
+    _, folder, how = evaluated(monkeypatch, "n12-informed", "--executions", "argmax", "stuck,idle")
     assert how["executions"] == [Execution(shield="pibt"), Execution(sample="stuck")]
     assert str(folder) == "evaluation/n12-informed"
-    _, folder, how = examined(monkeypatch, "--executions", "argmax")
+    _, folder, how = evaluated(monkeypatch, "--executions", "argmax")
     assert how["executions"] == [Execution(shield="pibt_swap", temperature=1.5)]
     assert str(folder) == "evaluation/general"
-    _, _, how = examined(monkeypatch)
+    _, _, how = evaluated(monkeypatch)
     assert [each.sample for each in how["executions"]] == ["fallback", False]
 
 
 @pytest.mark.parametrize("split", ["test", "validation"])
-def test_every_option_reaches_the_examination(file, monkeypatch, tmp_path, split):
-    config, folder, how = examined(
+def test_every_option_reaches_the_evaluation(file, monkeypatch, tmp_path, split):
+    config, folder, how = evaluated(
         monkeypatch, str(file), *CHANGES.split(), "--split", split, "--out", str(tmp_path / "out")
     )
     size = {"test_maps": 2, "cases_per_map": 3}
@@ -123,11 +125,11 @@ def test_it_writes_numbers_and_an_animation(file, capsys):
 def test_the_rows_of_a_policy_are_its_own_execution_drawn_in_three_ways(file, monkeypatch):
     execution = Execution(sample=True, temperature=0.5, shield="pibt", comm_weights="distance")
     save(DecentralizedPolicy(CONFIG.policy, execution), file, training=CONFIG.to_toml())
-    _, _, how = examined(monkeypatch, str(file))
+    _, _, how = evaluated(monkeypatch, str(file))
     assert how["executions"] == [replace(execution, sample=sample) for sample in (False, "stuck", True)]
-    _, _, how = examined(monkeypatch, str(file), "--executions", "stuck")
+    _, _, how = evaluated(monkeypatch, str(file), "--executions", "stuck")
     assert how["executions"] == [replace(execution, sample="stuck")]
-    _, _, how = examined(monkeypatch, str(file), "--executions", "stuck,1,idle,binary")
+    _, _, how = evaluated(monkeypatch, str(file), "--executions", "stuck,1,idle,binary")
     assert how["executions"] == [Execution(sample="stuck", comm_weights="binary")]
 
 
@@ -144,7 +146,7 @@ def test_families_of_training_have_a_table_each_unless_a_map_is_asked_for(file, 
     assert list(sized["tables"]) == [
         f"{N} robots, family {family}" for family in ("1 (cells)", "2 (maze)") for N in (2, 4)
     ]
-    config, _, _ = examined(monkeypatch, str(file), "--height", "9", "--out", str(file.parent / "high"))
+    config, _, _ = evaluated(monkeypatch, str(file), "--height", "9", "--out", str(file.parent / "high"))
     assert config == replace(CONFIG, height=9)
 
 
@@ -159,7 +161,7 @@ def test_evaluations_of_other_families_are_not_mixed_up(file, capsys):
 
 
 @pytest.mark.parametrize("split", ["test", "validation"])
-def test_the_users_files_are_examined(file, tmp_path, capsys, split):
+def test_the_users_files_are_evaluated(file, tmp_path, capsys, split):
     grid = random_instance(height=6, width=7, density=0.1, seed=0).grid
     instances = [random_instance(grid=grid, num_agents=2 + seed % 3, seed=seed) for seed in range(20)]
     save_instances(tmp_path / "set.json", instances)
@@ -185,7 +187,7 @@ def test_lifelong_teams_have_a_table_of_throughput(file, capsys):
             "argmax",
             "stuck,1",
             "sampled,1",
-            *evaluation.LIFELONG_BASELINES,
+            *metrics.LIFELONG_BASELINES,
         ]
         rates = {row["name"]: row["throughput"]["mean"] for row in table["rows"]}
         assert rates["PIBT*"] > rates["random"] >= 0
@@ -294,7 +296,7 @@ def test_a_mistake_takes_one_line(file, capsys, wrong):
 
 def test_a_policy_without_settings_meets_the_papers_cases(tmp_path, monkeypatch):
     save(DecentralizedPolicy(CONFIG.policy), tmp_path / "policy.safetensors")
-    config, _, _ = examined(monkeypatch, str(tmp_path / "policy.safetensors"), "--maps", "1")
+    config, _, _ = evaluated(monkeypatch, str(tmp_path / "policy.safetensors"), "--maps", "1")
     assert config == replace(TrainConfig(), test_maps=1)
 
 
@@ -302,15 +304,15 @@ def test_each_team_size_is_written_when_it_is_finished_and_not_played_again(file
     numbers, sizes = file.parent / "evaluation" / "results.json", ["2", "3", "4"]
     whole = file.parent / "whole"
     evaluate.main([str(file), "--num-agents", *sizes, "--out", str(whole)])
-    compare, played = evaluation.compare, []
+    compare, played = metrics.compare, []
 
-    def interrupted(exam, *given, **options):
-        played.append(exam.instances[0].num_agents)
+    def interrupted(reference, *given, **options):
+        played.append(reference.instances[0].num_agents)
         if len(played) == 3:
             raise KeyboardInterrupt
-        return compare(exam, *given, **options)
+        return compare(reference, *given, **options)
 
-    monkeypatch.setattr(evaluation, "compare", interrupted)
+    monkeypatch.setattr(metrics, "compare", interrupted)
     with pytest.raises(SystemExit) as end:
         evaluate.main([str(file), "--num-agents", *sizes])
     assert end.value.code == 130

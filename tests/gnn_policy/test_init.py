@@ -50,7 +50,7 @@ def test_every_public_name_is_defined_where_the_package_says():
     program = (
         "import sys, gnn_policy\n"
         "assert not {'torch', 'torchrl', 'matplotlib'} & sys.modules.keys()\n"
-        "import gnn_policy.evaluation\n"  # imports the module `rollout`
+        "import gnn_policy.metrics\n"  # imports the module `rollout`
         "for name in gnn_policy.__all__:\n"
         "    assert callable(getattr(gnn_policy, name)), name\n"
         "from gnn_policy import *\n"

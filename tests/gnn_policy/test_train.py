@@ -96,7 +96,7 @@ def test_a_file_of_settings_that_is_wrong_takes_one_line(tmp_path, capsys, conte
     assert not (tmp_path / "run").exists()
 
 
-def test_mixed_families_are_trained_and_examined_by_one_command(tmp_path, monkeypatch, capsys):
+def test_mixed_families_are_trained_and_evaluated_by_one_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     MIXED.save(tmp_path / "mixed.toml")
     train.main(["--config", "mixed.toml"])

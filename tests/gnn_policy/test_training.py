@@ -151,7 +151,7 @@ def test_seconds_are_those_of_the_clock(tmp_path, monkeypatch):
     def stop(row):
         raise StopError
 
-    monkeypatch.setattr("experts.relabel", slow(training.evaluation.experts.relabel, 7))
+    monkeypatch.setattr("experts.relabel", slow(training.metrics.experts.relabel, 7))
     monkeypatch.setattr(Demonstrations, "save", slow(Demonstrations.save, 2))
     monkeypatch.setattr(BatchMaker, "batch", slow(BatchMaker.batch, 1))
     monkeypatch.setattr(training, "rollout", slow(rollout, 50))
@@ -199,8 +199,8 @@ def test_batch_statistics_are_learnt_in_fitting_only(run):
 
 def test_validation_is_the_share_of_validation_cases_that_are_solved(run):
     cases = CONFIG.cases("validation").instances
-    exam = training.evaluation.Exam.prepare(cases, w=CONFIG.w, timeout=CONFIG.timeout, threads=1)
-    played = rollout(run.policy, cases, max_steps=exam.max_steps, seed=CONFIG.seed)
+    reference = training.metrics.ReferenceSet.prepare(cases, w=CONFIG.w, timeout=CONFIG.timeout, threads=1)
+    played = rollout(run.policy, cases, max_steps=reference.max_steps, seed=CONFIG.seed)
     assert run.history[-1].validation_success == played.success.mean()
 
 
@@ -216,13 +216,13 @@ def test_validation_is_the_share_of_validation_cases_that_are_solved(run):
 def test_the_best_validated_round_is_kept(tmp_path, monkeypatch, merits, best):
     answers = iter(merits)
 
-    def judge(name, exam, played):
+    def judge(name, reference, played):
         success, increase = next(answers)
         return SimpleNamespace(
             success_rate=SimpleNamespace(mean=success), flowtime_increase=SimpleNamespace(mean=increase)
         )
 
-    monkeypatch.setattr(training.evaluation, "score", judge)
+    monkeypatch.setattr(training.metrics, "score", judge)
     snapshots = []
     folder = tmp_path / "run"
     run = Training(

@@ -11,11 +11,11 @@ import torch
 from rich.console import Console
 
 import experts
-from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluation, rollout
+from gnn_policy import DecentralizedPolicy, PolicyConfig, metrics, rollout
 from gnn_policy.baselines import GreedyActor, RandomActor
 from gnn_policy.cases import Family, make_cases
-from gnn_policy.evaluation import LIFELONG_BASELINES, Estimate, Exam
 from gnn_policy.execution import Execution
+from gnn_policy.metrics import LIFELONG_BASELINES, Estimate, ReferenceSet
 from mapf_env import Instance, random_instance
 
 
@@ -90,36 +90,38 @@ class Dawdler(Walker):
 
 
 def test_flowtime_increase_by_hand():
-    exam = Exam.prepare(corridor((0, 4), (1, 2), (3, 0), (5, 5)), w=1.0, timeout=3.0, threads=1)
-    assert exam.max_steps.tolist() == [12, 3, 9, 1]
-    assert exam.flowtimes.tolist() == [4, 1, 3, 0]
-    assert exam.lower_bounds.tolist() == [4, 1, 3, 0]
-    walked = evaluation.score("walker", exam, rollout(Walker(), exam.instances, max_steps=exam.max_steps))
+    reference = ReferenceSet.prepare(corridor((0, 4), (1, 2), (3, 0), (5, 5)), w=1.0, timeout=3.0, threads=1)
+    assert reference.max_steps.tolist() == [12, 3, 9, 1]
+    assert reference.flowtimes.tolist() == [4, 1, 3, 0]
+    assert reference.lower_bounds.tolist() == [4, 1, 3, 0]
+    walked = metrics.score("walker", reference, rollout(Walker(), reference.instances, max_steps=reference.max_steps))
     assert walked.success_rate.mean == 3 / 4
     assert walked.flowtime_increase.mean == pytest.approx((0 + 0 + 6 / 3 + 0) / 4)
     assert walked.flowtime_increase_solved.mean == 0
     assert walked.makespan.mean == pytest.approx((4 + 1 + 0) / 3)
     assert walked.latched == 3 / 4
-    dawdled = evaluation.score("dawdler", exam, rollout(Dawdler(), exam.instances, max_steps=exam.max_steps))
+    dawdled = metrics.score(
+        "dawdler", reference, rollout(Dawdler(), reference.instances, max_steps=reference.max_steps)
+    )
     assert dawdled.flowtime_increase.mean == pytest.approx((2 / 4 + 2 / 1 + 6 / 3 + 0) / 4)
     assert dawdled.flowtime_increase_solved.mean == pytest.approx((2 / 4 + 2 / 1 + 0) / 3)
 
 
 def test_a_time_limit_is_rounded_up_and_never_zero():
-    exam = Exam.prepare(corridor((0, 5), (2, 2)), w=1.0, timeout=1.5, threads=1)
-    assert exam.max_steps.tolist() == [8, 1]
+    reference = ReferenceSet.prepare(corridor((0, 5), (2, 2)), w=1.0, timeout=1.5, threads=1)
+    assert reference.max_steps.tolist() == [8, 1]
 
 
 def test_cases_that_the_expert_does_not_solve_are_counted_and_left_out():
     cases = corridor((0, 4), (1, 2), (3, 0))
     swap = Instance(np.zeros((1, 2), bool), [[0, 0], [0, 1]], [[0, 1], [0, 0]])
     with pytest.raises(ValueError, match="solved none of the 1 cases"):
-        Exam.prepare([swap], w=1.0, timeout=3.0, threads=1)
+        ReferenceSet.prepare([swap], w=1.0, timeout=3.0, threads=1)
     pairs = [swap, Instance(np.zeros((1, 2), bool), [[0, 0], [0, 1]], [[0, 0], [0, 1]])]
-    exam = Exam.prepare(pairs, w=1.0, timeout=3.0, threads=1)
-    assert exam.unsolved == 1
-    assert exam.instances == pairs[1:]
-    assert Exam.prepare(cases, w=1.0, timeout=3.0, threads=1).unsolved == 0
+    reference = ReferenceSet.prepare(pairs, w=1.0, timeout=3.0, threads=1)
+    assert reference.unsolved == 1
+    assert reference.instances == pairs[1:]
+    assert ReferenceSet.prepare(cases, w=1.0, timeout=3.0, threads=1).unsolved == 0
 
 
 def test_lacam_plans_the_cases_where_ecbs_has_no_proof():
@@ -127,17 +129,17 @@ def test_lacam_plans_the_cases_where_ecbs_has_no_proof():
     left = experts.solve(crowd, w=1.01, node_limit=500)
     assert left.solution is not None
     assert not left.solved
-    exam = Exam.prepare([crowd], w=1.01, timeout=3.0, threads=1, nodes=500)
+    reference = ReferenceSet.prepare([crowd], w=1.01, timeout=3.0, threads=1, nodes=500)
     plan = experts.lacam(crowd, node_limit=500).solution
     assert plan
-    assert np.array_equal(exam.solutions[0].paths, plan.paths)
+    assert np.array_equal(reference.solutions[0].paths, plan.paths)
 
 
 def test_which_cases_the_expert_solves_is_no_matter_of_time(monkeypatch):
     asked = []
     solve = experts.solve_many
     monkeypatch.setattr(experts, "solve_many", lambda *cases, **how: (asked.append(how), solve(*cases, **how))[1])
-    Exam.prepare(corridor((0, 4)), w=1.0, timeout=3.0, threads=1)
+    ReferenceSet.prepare(corridor((0, 4)), w=1.0, timeout=3.0, threads=1)
     assert asked[0]["time_limit"] == math.inf
     assert 0 < asked[0]["node_limit"] < math.inf
 
@@ -155,72 +157,72 @@ def compared():
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2))
     family = Family(num_agents=(4, 4), height=(6, 6), width=(6, 6), density=(0.1, 0.1))
     cases = make_cases("test", seed=0, maps=5, cases_per_map=3, families=[family]).instances
-    exam = Exam.prepare(cases, w=1.05, timeout=3.0, threads=1)
+    reference = ReferenceSet.prepare(cases, w=1.05, timeout=3.0, threads=1)
     phases = []
-    rows, played = evaluation.compare(exam, policy, EXECUTIONS, seed=3, progress=phases.append)
-    return exam, policy, rows, played, phases
+    rows, played = metrics.compare(reference, policy, EXECUTIONS, seed=3, progress=phases.append)
+    return reference, policy, rows, played, phases
 
 
 def test_the_comparison_has_a_row_for_each_variant_and_competitor(compared):
-    exam, policy, rows, played, phases = compared
+    reference, policy, rows, played, phases = compared
     competitors = ["random", "greedy*", "greedy,stuck*", "PIBT*", "expert*"]
     assert [row.name for row in rows] == [each.name for each in EXECUTIONS] + competitors
-    assert list(evaluation.BASELINES) == competitors
+    assert list(metrics.BASELINES) == competitors
     assert phases == [row.name for row in rows[:-1]]  # the expert's row is there before
     assert phases == [row.name for row in rows[:-1]]  # the expert's row is there before
-    settings = {"seed": 3, "max_steps": exam.max_steps}
+    settings = {"seed": 3, "max_steps": reference.max_steps}
     for execution, row, seen in zip(EXECUTIONS, rows, played, strict=False):
-        again = rollout(policy, exam.instances, execution=execution, **settings)
-        assert row == evaluation.score(execution.name, exam, again)
+        again = rollout(policy, reference.instances, execution=execution, **settings)
+        assert row == metrics.score(execution.name, reference, again)
         assert np.array_equal(seen.flowtime, again.flowtime)
     actors = [RandomActor(), GreedyActor(), GreedyActor(random_when_stuck=True)]
     for actor, row in zip(actors, rows[3:6], strict=True):
-        assert row == evaluation.score(row.name, exam, rollout(actor, exam.instances, **settings))
+        assert row == metrics.score(row.name, reference, rollout(actor, reference.instances, **settings))
 
 
 def test_a_policy_that_sees_the_cost_to_go_is_marked_as_one_that_knows_the_map(compared):
-    exam = compared[0]
+    reference = compared[0]
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2, extra_channels=("cost_to_go",)))
-    rows, _ = evaluation.compare(exam, policy, EXECUTIONS[:1])
+    rows, _ = metrics.compare(reference, policy, EXECUTIONS[:1])
     assert rows[0].name == "argmax*"
 
 
 def test_pibt_is_measured_like_everybody(compared):
-    exam, _, rows, _, _ = compared
+    reference, _, rows, _, _ = compared
     increases, solved = [], 0
-    for case, limit, base in zip(exam.instances, exam.max_steps, exam.flowtimes, strict=True):
+    for case, limit, base in zip(reference.instances, reference.max_steps, reference.flowtimes, strict=True):
         result = experts.pibt(case, max_steps=int(limit), seed=3)
         solved += result.solved
         flowtime = result.solution.sum_of_costs if result.solution else limit * case.num_agents
         increases.append(flowtime / base - 1)
-    assert rows[6].success_rate.mean == solved / len(exam.instances)
+    assert rows[6].success_rate.mean == solved / len(reference.instances)
     assert rows[6].flowtime_increase.mean == pytest.approx(np.mean(increases))
 
 
 def test_the_expert_is_its_own_measure(compared):
-    exam, _, rows, _, _ = compared
+    reference, _, rows, _, _ = compared
     expert = rows[7]
     assert (expert.success_rate.mean, expert.flowtime_increase.mean, expert.latched) == (1.0, 0.0, 1.0)
-    assert expert.makespan.mean == pytest.approx(np.mean([each.makespan for each in exam.solutions]))
-    assert all(base >= bound for base, bound in zip(exam.flowtimes, exam.lower_bounds, strict=True))
-    assert (exam.flowtimes <= 1.05 * exam.lower_bounds + 1e-9).all()
+    assert expert.makespan.mean == pytest.approx(np.mean([each.makespan for each in reference.solutions]))
+    assert all(base >= bound for base, bound in zip(reference.flowtimes, reference.lower_bounds, strict=True))
+    assert (reference.flowtimes <= 1.05 * reference.lower_bounds + 1e-9).all()
 
 
 def test_the_numbers_are_strict_json_also_where_nothing_was_solved(compared):
-    exam, _, rows, _, _ = compared
-    nothing = Exam.prepare(corridor((3, 0)), w=1.0, timeout=1.0, threads=1)
-    lost = evaluation.score("lost", nothing, rollout(Walker(), nothing.instances, max_steps=nothing.max_steps))
-    for data in (evaluation.as_json(rows, exam), evaluation.as_json([lost], nothing)):
+    reference, _, rows, _, _ = compared
+    nothing = ReferenceSet.prepare(corridor((3, 0)), w=1.0, timeout=1.0, threads=1)
+    lost = metrics.score("lost", nothing, rollout(Walker(), nothing.instances, max_steps=nothing.max_steps))
+    for data in (metrics.as_json(rows, reference), metrics.as_json([lost], nothing)):
         assert json.loads(json.dumps(data, allow_nan=False)) == data
         assert "makespan" in json.dumps(data)
-    (row,) = json.loads(json.dumps(evaluation.as_json([lost], nothing)))["rows"]
+    (row,) = json.loads(json.dumps(metrics.as_json([lost], nothing)))["rows"]
     assert row["makespan"]["mean"] is None
 
 
 def test_the_table_shows_every_figure_within_eighty_columns(compared):
-    exam, _, rows, _, _ = compared
+    reference, _, rows, _, _ = compared
     shown = io.StringIO()
-    Console(file=shown, width=80).print(evaluation.table("teams", evaluation.as_json(rows, exam)))
+    Console(file=shown, width=80).print(metrics.table("teams", metrics.as_json(rows, reference)))
     text = shown.getvalue()
     assert "…" not in text
     for row in rows:
@@ -237,32 +239,32 @@ def test_wilson_narrows_with_more_cases():
 
 
 def test_a_lifelong_comparison_is_the_throughput_of_every_row(compared):
-    exam, policy, _, _, _ = compared
+    reference, policy, _, _, _ = compared
     phases = []
-    table, played = evaluation.compare_lifelong(
-        exam.instances, policy, EXECUTIONS, steps=30, seed=3, progress=phases.append
+    table, played = metrics.compare_lifelong(
+        reference.instances, policy, EXECUTIONS, steps=30, seed=3, progress=phases.append
     )
     names = [*(each.name for each in EXECUTIONS), "random", "greedy*", "PIBT*"]
     assert [row["name"] for row in table["rows"]] == phases == names
-    assert (table["cases"], table["steps"]) == (len(exam.instances), 30)
+    assert (table["cases"], table["steps"]) == (len(reference.instances), 30)
     players = [*((policy, each) for each in EXECUTIONS), *((each, None) for each in LIFELONG_BASELINES.values())]
     for row, (player, execution) in zip(table["rows"], players, strict=True):
-        again = rollout(player, exam.instances, task="lifelong", execution=execution, seed=3, max_steps=30)
+        again = rollout(player, reference.instances, task="lifelong", execution=execution, seed=3, max_steps=30)
         assert row["throughput"]["mean"] == again.throughput.mean()
         assert all(len(each.paths) == 31 for each in again.solutions), "a lifelong team never ends before"
     for execution, seen in zip(EXECUTIONS, played, strict=True):
-        again = rollout(policy, exam.instances, task="lifelong", execution=execution, seed=3, max_steps=30)
+        again = rollout(policy, reference.instances, task="lifelong", execution=execution, seed=3, max_steps=30)
         assert np.array_equal(seen.throughput, again.throughput)
     assert json.loads(json.dumps(table, allow_nan=False)) == table
     shown = io.StringIO()
-    Console(file=shown, width=80).print(evaluation.lifelong_table("teams", table))
+    Console(file=shown, width=80).print(metrics.lifelong_table("teams", table))
     for row in table["rows"]:
         assert f"{row['throughput']['mean']:.3f}" in shown.getvalue()
 
 
 def test_throughput_by_hand():
     """An arrival is a step that ends on the goal that the robot had when it began."""
-    table, _ = evaluation.compare_lifelong(corridor((0, 4)), compared_policy(), [Execution()], steps=40, seed=0)
+    table, _ = metrics.compare_lifelong(corridor((0, 4)), compared_policy(), [Execution()], steps=40, seed=0)
     greedy = rollout(GreedyActor(), corridor((0, 4)), task="lifelong", max_steps=40, seed=0)
     arrivals = sum(
         bool((cells == goals).all())

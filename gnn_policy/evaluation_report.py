@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from gnn_policy import checkpoint, evaluation
+from gnn_policy import checkpoint, metrics
 from gnn_policy.cases import Split, Task
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
@@ -28,7 +28,7 @@ from gnn_policy.rollout import Rollouts
 from mapf_env import EnvConfig, Scene, animate, replay_scenes
 
 
-def examine(
+def evaluate_and_report(
     policy: DecentralizedPolicy,
     config: TrainConfig,
     folder: Path,
@@ -38,7 +38,7 @@ def examine(
     executions: Sequence[Execution] | None = None,
     split: Split = "test",
     task: Task = "one_shot",
-    steps: int = evaluation.LIFELONG_STEPS,
+    steps: int = metrics.LIFELONG_STEPS,
     whole: bool = False,
     threads: int,
     failures: int = 0,
@@ -85,8 +85,8 @@ def examine(
     tables = read_tables(numbers)
     finished = set() if failures or tables.keys() >= cases.keys() else tables.keys() & cases.keys()
     held_out = {name: each.cases(split, whole=whole).instances for name, each in cases.items() if name not in finished}
-    show = evaluation.table if task == "one_shot" else evaluation.lifelong_table
-    rivals = evaluation.BASELINES if task == "one_shot" else evaluation.LIFELONG_BASELINES
+    show = metrics.table if task == "one_shot" else metrics.lifelong_table
+    rivals = metrics.BASELINES if task == "one_shot" else metrics.LIFELONG_BASELINES
     scenes: list[Scene] = []
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("", total=len(held_out) * (len(executions) + len(rivals)))
@@ -100,20 +100,20 @@ def examine(
                 progress.update(bar, description=f"{title}: {phase}", advance=1)
 
             if task == "lifelong":
-                tables[name], shown = evaluation.compare_lifelong(
+                tables[name], shown = metrics.compare_lifelong(
                     held_out[name], policy, executions, steps=steps, seed=config.seed, progress=advance
                 )
             else:
                 progress.update(bar, description=f"{title}: expert")
-                exam = evaluation.Exam.prepare(
-                    held_out[name], w=config.w, timeout=config.timeout, threads=threads, nodes=config.exam_nodes
+                reference = metrics.ReferenceSet.prepare(
+                    held_out[name], w=config.w, timeout=config.timeout, threads=threads, nodes=config.reference_nodes
                 )
-                rows, shown = evaluation.compare(exam, policy, executions, seed=config.seed, progress=advance)
+                rows, shown = metrics.compare(reference, policy, executions, seed=config.seed, progress=advance)
                 progress.advance(bar)
                 kinds = {each.name: count_failures(played) for each, played in zip(executions, shown, strict=True)}
-                tables[name] = {**evaluation.as_json(rows, exam), "failures": kinds}
+                tables[name] = {**metrics.as_json(rows, reference), "failures": kinds}
                 if failures:
-                    scenes += worst(shown[0], exam.solutions, failures)
+                    scenes += worst(shown[0], reference.solutions, failures)
                     heading = f"The worst cases of {executions[0].name} next to the expert's solutions"
                     perceived = EnvConfig(**executions[0].env_settings(policy.config))
                     replay_scenes(scenes, folder / "failures.html", title=heading, config=perceived)

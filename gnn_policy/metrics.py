@@ -21,7 +21,7 @@ from mapf_env import Instance, Solution
 
 LIFELONG_STEPS = 256
 """Steps of a lifelong episode in validation, and by default in evaluation."""
-EXAM_NODES = 200_000
+REFERENCE_NODES = 200_000
 """High-level nodes that the expert may generate for a held-out case; several seconds of search."""
 
 
@@ -53,7 +53,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Exam:
+class ReferenceSet:
     """Cases with the expert's solution, which sets the time limit and the flowtime to compare with."""
 
     instances: list[Instance]
@@ -67,8 +67,8 @@ class Exam:
 
     @staticmethod
     def prepare(
-        instances: Sequence[Instance], *, w: float, timeout: float, threads: int, nodes: int = EXAM_NODES
-    ) -> Exam:
+        instances: Sequence[Instance], *, w: float, timeout: float, threads: int, nodes: int = REFERENCE_NODES
+    ) -> ReferenceSet:
         """Solve the cases by the expert; T_max is `timeout` times the makespan of its solution.
 
         LaCAM plans the cases that ECBS leaves, also where ECBS has a plan without a proof. The cases that are solved
@@ -95,7 +95,7 @@ class Exam:
         if not known:
             raise ValueError(f"the expert solved none of the {len(instances)} cases: make them easier or raise w")
         solutions = [plan for i in known if (plan := results[i].solution) is not None]
-        return Exam(
+        return ReferenceSet(
             [instances[i] for i in known],
             solutions,
             np.array([results[i].lower_bound for i in known], np.int64),
@@ -104,10 +104,10 @@ class Exam:
         )
 
     @staticmethod
-    def without_expert(instances: Sequence[Instance], max_steps: int) -> Exam:
+    def without_expert(instances: Sequence[Instance], max_steps: int) -> ReferenceSet:
         """Return cases of lifelong tasks, which have no solution and end after `max_steps`."""
         limits = np.full(len(instances), max_steps, np.int64)
-        return Exam(list(instances), [], np.zeros(0, np.int64), limits, 0)
+        return ReferenceSet(list(instances), [], np.zeros(0, np.int64), limits, 0)
 
     @property
     def flowtimes(self) -> npt.NDArray[np.int64]:
@@ -136,9 +136,9 @@ class Score:
     """Share of cases in which every robot touched its goal at least once (the released code's success)."""
 
 
-def score(name: str, exam: Exam, rollouts: Rollouts) -> Score:
+def score(name: str, reference: ReferenceSet, rollouts: Rollouts) -> Score:
     """The metrics of played cases."""
-    increase = exam.increase(rollouts.flowtime)
+    increase = reference.increase(rollouts.flowtime)
     return Score(
         name,
         Estimate.proportion(rollouts.success),
@@ -150,7 +150,7 @@ def score(name: str, exam: Exam, rollouts: Rollouts) -> Score:
 
 
 def compare(
-    exam: Exam,
+    reference: ReferenceSet,
     policy: DecentralizedPolicy,
     executions: Sequence[Execution],
     *,
@@ -166,36 +166,40 @@ def compare(
     mark = "*" if policy.config.needs_map else ""
     for execution in executions:
         progress(execution.name)
-        played.append(rollout(policy, exam.instances, execution=execution, seed=seed, max_steps=exam.max_steps))
-        rows.append(score(execution.name + mark, exam, played[-1]))
-    return [*rows, *baselines(exam, seed=seed, progress=progress)], played
+        played.append(
+            rollout(policy, reference.instances, execution=execution, seed=seed, max_steps=reference.max_steps)
+        )
+        rows.append(score(execution.name + mark, reference, played[-1]))
+    return [*rows, *baselines(reference, seed=seed, progress=progress)], played
 
 
 BASELINES = ("random", "greedy*", "greedy,stuck*", "PIBT*", "expert*")
 """The names of those that learn nothing; with a star they know the whole map."""
 
 
-def baselines(exam: Exam, *, seed: int = 0, progress: Callable[[str], None] = lambda phase: None) -> list[Score]:
+def baselines(
+    reference: ReferenceSet, *, seed: int = 0, progress: Callable[[str], None] = lambda phase: None
+) -> list[Score]:
     """The rows of `BASELINES`: two greedy ones, the second of which moves at random where it is stuck."""
-    cases, rows = exam.instances, []
+    cases, rows = reference.instances, []
     actors = (RandomActor(), GreedyActor(), GreedyActor(random_when_stuck=True))
     for name, actor in zip(BASELINES, actors, strict=False):
         progress(name)
-        rows.append(score(name, exam, rollout(actor, cases, seed=seed, max_steps=exam.max_steps)))
+        rows.append(score(name, reference, rollout(actor, cases, seed=seed, max_steps=reference.max_steps)))
     progress("PIBT*")
-    return [*rows, _pibt_score(exam, seed), _expert_score(exam)]
+    return [*rows, _pibt_score(reference, seed), _expert_score(reference)]
 
 
-def _pibt_score(exam: Exam, seed: int) -> Score:
+def _pibt_score(reference: ReferenceSet, seed: int) -> Score:
     results = [
         experts.pibt(instance, max_steps=int(limit), seed=seed)
-        for instance, limit in zip(exam.instances, exam.max_steps, strict=True)
+        for instance, limit in zip(reference.instances, reference.max_steps, strict=True)
     ]
     success = np.array([result.solution is not None for result in results])
     # Where PIBT fails it keeps no paths: all robots count T_max, an upper bound of its flowtime.
-    failed = exam.max_steps * np.array([each.num_agents for each in exam.instances])
+    failed = reference.max_steps * np.array([each.num_agents for each in reference.instances])
     costs = np.array([failed[i] if result.cost is None else result.cost for i, result in enumerate(results)])
-    increase = exam.increase(costs)
+    increase = reference.increase(costs)
     makespans = np.array([each.solution.makespan for each in results if each.solution is not None], np.float64)
     return Score(
         "PIBT*",
@@ -207,10 +211,10 @@ def _pibt_score(exam: Exam, seed: int) -> Score:
     )
 
 
-def _expert_score(exam: Exam) -> Score:
-    makespans = np.array([each.makespan for each in exam.solutions], np.float64)
+def _expert_score(reference: ReferenceSet) -> Score:
+    makespans = np.array([each.makespan for each in reference.solutions], np.float64)
     zero = Estimate(0.0, 0.0, 0.0)
-    solved = np.ones(len(exam.instances), np.bool_)
+    solved = np.ones(len(reference.instances), np.bool_)
     return Score("expert*", Estimate.proportion(solved), zero, zero, Estimate.average(makespans), 1.0)
 
 
@@ -279,13 +283,13 @@ def table(title: str, result: dict[str, Any]) -> Table:
     return shown
 
 
-def as_json(rows: Sequence[Score], exam: Exam) -> dict[str, Any]:
+def as_json(rows: Sequence[Score], reference: ReferenceSet) -> dict[str, Any]:
     """The rows as plain data; null stands for what is not a finite number."""
     plain = [_finite(asdict(row)) for row in rows]
     return {
-        "cases": len(exam.instances),
-        "unsolved_by_expert": exam.unsolved,
-        "expert_over_bound": _over_bound(exam),
+        "cases": len(reference.instances),
+        "unsolved_by_expert": reference.unsolved,
+        "expert_over_bound": _over_bound(reference),
         "rows": plain,
     }
 
@@ -296,9 +300,9 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _over_bound(exam: Exam) -> float:
+def _over_bound(reference: ReferenceSet) -> float:
     """The expert's flowtime over its lower bound, the mean of the cases."""
-    return float((np.maximum(exam.flowtimes, 1) / np.maximum(exam.lower_bounds, 1)).mean())
+    return float((np.maximum(reference.flowtimes, 1) / np.maximum(reference.lower_bounds, 1)).mean())
 
 
 def _caption(result: dict[str, Any]) -> str:
