@@ -1,4 +1,4 @@
-"""What makes a good teacher, and what aggregation is worth: `python benchmarks/ablation.py labels` or `dagger`.
+"""What makes a good expert, and what aggregation is worth: `python benchmarks/ablation.py labels` or `dagger`.
 
 Each variant differs from the default in the settings that its name says, and is trained on the same maps for the same
 small number of gradient steps on one thread. A run that is finished is not repeated and one that was interrupted goes
@@ -27,11 +27,11 @@ import experts
 from gnn_policy.command_line import run_command
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
+from gnn_policy.labelling import Labeller
 from gnn_policy.metrics import Estimate, ReferenceSet
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.recipes import RECIPES
 from gnn_policy.rollout import rollout
-from gnn_policy.teacher import Teacher
 from gnn_policy.training import Training
 from mapf_env import Action, BatchedEnv, Solution
 from mapf_env.files import replacing, write_whole
@@ -40,8 +40,8 @@ Variants = dict[str, dict[str, Any]]
 
 BASE = replace(
     RECIPES["quick"],
-    epochs=12,
-    updates_per_epoch=320,
+    rounds=12,
+    updates_per_round=320,
     dagger_steps=8_192,
     fresh_window=32_768,
     validation_cases_per_map=10,
@@ -58,13 +58,13 @@ LABELS: Variants = {
     "random order": {"robot_order": "random"},
     "farthest first": {"robot_order": "farthest"},
     "nearest first": {"robot_order": "nearest"},
-    "prioritised": {"teacher": "prioritised"},
-    "LaCAM": {"teacher": "lacam"},
-    "LaCAM improved": {"teacher": "ablation:improved_lacam"},
-    "PIBT": {"teacher": "pibt"},
+    "prioritised": {"expert": "prioritised"},
+    "LaCAM": {"expert": "lacam"},
+    "LaCAM improved": {"expert": "ablation:improved_lacam"},
+    "PIBT": {"expert": "pibt"},
 }
-JUDGED_AT_THE_END: dict[str, Any] = {"validate_every": BASE.epochs, "validation_cases_per_map": 1}
-"""Training's own validation goes by the teacher's w; that of the table has the same cases and time limits for all."""
+JUDGED_AT_THE_END: dict[str, Any] = {"validate_every": BASE.rounds, "validation_cases_per_map": 1}
+"""Validation in training uses the w of the expert; the table has the same cases and time limits for all."""
 DAGGER: Variants = {
     DEFAULT: {},
     "none": {"dagger_every": 0},
@@ -95,7 +95,7 @@ class Options:
     """Runs of each variant."""
     only: tuple[str, ...] = ()
     """Names of variants to train now; the table has all that are finished."""
-    updates: int = BASE.updates_per_epoch or 0
+    updates: int = BASE.updates_per_round or 0
     """Gradient steps in each of the 12 rounds."""
     debug: bool = False
     """Print the traceback of an error."""
@@ -135,7 +135,7 @@ def main(options: Options) -> None:
 def train(options: Options, name: str, config: TrainConfig, console: Console) -> None:
     """One run; its outcome is written at its end."""
     folder = run_folder(options.runs, name, config.seed)
-    progress = TrainingProgress(config.epochs, console)
+    progress = TrainingProgress(config.rounds, console)
     training = Training(config, folder, progress, clock=time.process_time)
     with progress:
         training.run()
@@ -168,7 +168,7 @@ def run_folder(runs: Path, name: str, seed: int) -> Path:
 
 def config_of(options: Options, name: str, seed: int) -> TrainConfig:
     """The settings of a run."""
-    settings = {"updates_per_epoch": options.updates, "seed": seed, **{**LABELS, **DAGGER}[name]}
+    settings = {"updates_per_round": options.updates, "seed": seed, **{**LABELS, **DAGGER}[name]}
     if name not in DAGGER:
         settings |= JUDGED_AT_THE_END
     return replace(BASE, **settings)
@@ -196,7 +196,7 @@ def expected_minutes(options: Options, variants: Variants) -> float:
         for seed in range(options.seeds)
         if (result := outcome(options, name, seed)) is not None
     ]
-    return float(np.mean(taken)) if taken else CPU_MINUTES * options.updates / (BASE.updates_per_epoch or 1)
+    return float(np.mean(taken)) if taken else CPU_MINUTES * options.updates / (BASE.updates_per_round or 1)
 
 
 @functools.cache
@@ -205,16 +205,16 @@ def reference_set() -> ReferenceSet:
     return ReferenceSet.prepare(BASE.cases("validation").instances, w=BASE.w, timeout=BASE.timeout, threads=1)
 
 
-class TeacherActor:
-    """Asks the teacher again in every state and does what it says.
+class ExpertActor:
+    """Asks the expert again in every state and does what it says.
 
     Args:
-        teacher: The teacher.
+        labeller: Asks the expert.
         grids: Its maps, all of one size.
     """
 
-    def __init__(self, teacher: Teacher, grids: Sequence[npt.NDArray[np.bool_]]) -> None:
-        self.teacher, self.states = teacher, 0
+    def __init__(self, labeller: Labeller, grids: Sequence[npt.NDArray[np.bool_]]) -> None:
+        self.labeller, self.states = labeller, 0
         self._number = {grid.tobytes(): number for number, grid in enumerate(grids)}
 
     def env_settings(self) -> dict[str, Any]:
@@ -225,7 +225,7 @@ class TeacherActor:
         """Return the labels (B, N)."""
         running = np.flatnonzero(env.running)
         maps = np.array([self._number[grid.tobytes()] for grid in env.grids[running]], np.int32)
-        moves, _ = self.teacher.moves(replace(env.states(env.running), maps=maps))
+        moves, _ = self.labeller.moves(replace(env.states(env.running), maps=maps))
         actions = np.full((env.num_envs, env.num_agents), Action.IDLE)
         actions[running] = moves.reshape(len(running), -1)
         self.states += len(running)
@@ -244,16 +244,16 @@ def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
         console.print(f"quality of labels: {name}")
         config = replace(BASE, **settings)
         grids = list({each.grid.tobytes(): each.grid for each in reference.instances}.values())
-        teacher = Teacher(
+        labeller = Labeller(
             grids,
-            solver=config.teacher,
+            solver=config.expert,
             w=config.w,
             robot_order=config.robot_order,
             node_limit=config.expert_nodes,
             threads=1,
             clock=time.process_time,
         )
-        actor = TeacherActor(teacher, grids)
+        actor = ExpertActor(labeller, grids)
         played = rollout(actor, reference.instances, max_steps=reference.max_steps)
         solved = played.success
         known[name] = {
@@ -261,7 +261,7 @@ def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
             "over_bound": float(played.flowtime[solved].sum() / bounds[solved].sum()),
             "makespan": float(played.makespan[solved].mean()),
             "waits": waiting([played.solutions[case] for case in np.flatnonzero(solved)]),
-            "microseconds": teacher.seconds / actor.states * 1e6,
+            "microseconds": labeller.seconds / actor.states * 1e6,
         }
         write_whole(file, json.dumps(known, indent=2) + "\n")
     return known

@@ -68,7 +68,7 @@ def train(experiment: Experiment, console: Console) -> None:
     for model in experiment.untrained():
         console.rule(f"training {model.name}")
         config = replace(model.config, threads=experiment.threads)
-        with TrainingProgress(config.epochs, console) as progress:
+        with TrainingProgress(config.rounds, console) as progress:
             try:
                 training = Training(config, experiment.run_of(model), progress)
             except RunLockedError:
@@ -192,7 +192,7 @@ def _training_seconds(model: Model) -> float:
         logits.float().square().mean().backward()
         optimizer.step()
 
-    return 1.4 * config.epochs * (config.updates_per_epoch or 0) * _seconds(step)
+    return 1.4 * config.rounds * (config.updates_per_round or 0) * _seconds(step)
 
 
 def _test_seconds(experiment: Experiment, scene: Scene, model: Model) -> float:

@@ -208,7 +208,7 @@ class Experiment:
         metrics, config = (self.run_of(model) / name for name in ("metrics.csv", "config.toml"))
         if config.exists():
             model.config.refuse_other(TrainConfig.load(config), f"{self.run_of(model)} holds a model of", "--folder")
-        return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.epochs
+        return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.rounds
 
     def cases_per_map(self, scene: Scene) -> int:
         """Test cases on each map of a scene."""

@@ -47,7 +47,7 @@ ROUNDS = 5
 UPDATES = 200
 CONFIG = replace(
     RECIPES["quick"],
-    epochs=ROUNDS + 1,
+    rounds=ROUNDS + 1,
     train_maps=500,
     validation_maps=1,
     validation_cases_per_map=1,
@@ -132,7 +132,7 @@ def parts_of_a_round() -> None:
     """One line for each part of a round of DAgger: seconds, and its share of the bare gradient steps."""
     config = CONFIG
     torch.set_num_threads(1)
-    updates, plays = config.updates_per_epoch or 0, config.dagger_steps / config.rollout_teams
+    updates, plays = config.updates_per_round or 0, config.dagger_steps / config.rollout_teams
     policy = DecentralizedPolicy(config.policy)
 
     def network() -> tuple[float, float, float]:
@@ -144,7 +144,7 @@ def parts_of_a_round() -> None:
 
     before = network()
     with tempfile.TemporaryDirectory() as folder:
-        training = Training(config, Path(folder), TrainingProgress(config.epochs, Console(quiet=True)))
+        training = Training(config, Path(folder), TrainingProgress(config.rounds, Console(quiet=True)))
         training.run()
         rounds = training.history[1:]  # the first has no rollouts of the policy
     steps, forward, environment = np.mean([before, network()], axis=0)
@@ -196,7 +196,7 @@ def with_library_convolutions(policy: DecentralizedPolicy) -> None:
 def fitted(run: Path, processes: int, threads: int) -> float:
     """Robot states a second in the gradient steps of the quick recipe's batch."""
     settings = f"""
-        --epochs 1 --updates-per-epoch {UPDATES} --train-maps 100 --validation-maps 1 --validation-cases-per-map 1
+        --rounds 1 --updates-per-round {UPDATES} --train-maps 100 --validation-maps 1 --validation-cases-per-map 1
         --test-maps 1 --cases-per-map 1 --demonstration-steps 8192 --dagger-every 0
     """
     start = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), "-m"]
@@ -225,7 +225,7 @@ def threads_and_processes() -> None:
 def seconds_of_a_round(run: Path, *options: str) -> float:
     """Median time of the rounds after the first in a short training with the quick recipe's batches."""
     settings = """
-        --epochs 5 --updates-per-epoch 200 --train-maps 200 --validation-maps 1 --validation-cases-per-map 1
+        --rounds 5 --updates-per-round 200 --train-maps 200 --validation-maps 1 --validation-cases-per-map 1
         --test-maps 1 --cases-per-map 1 --demonstration-steps 8192 --dagger-steps 8192 --validate-every 5
     """
     command = [sys.executable, "-m", "gnn_policy.train", "--run", str(run), *settings.split(), *options]

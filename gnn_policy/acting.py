@@ -73,7 +73,7 @@ def scores_of(policy: nn.Module, bag: Bag, execution: Execution, noise: Any) -> 
     alarm = np.zeros(len(bag.team), np.bool_)
     if "stuck" in facts:
         alarm = facts["stuck"][:, 0]
-        if execution.sample == "stuck" and config.taps > 1:  # with one tap robots do not communicate
+        if execution.actions == "stuck" and config.taps > 1:  # with one tap robots do not communicate
             alarm = alarmed(alarm, bag.edge_index)
     jammed = facts["jammed"][:, 0] if "jammed" in facts else None
     return execution.scores(logits_of(policy, bag), alarm, noise, facts.get("greedy_moves"), jammed)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import tomli_w
 
 from gnn_policy.cases import Cases, Family, Split, Task, cases_of_files, make_cases
-from gnn_policy.execution import Execution, Sample
+from gnn_policy.execution import Actions, Execution
 from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.settings import check_types
 from mapf_env.arguments import share
@@ -70,30 +70,30 @@ class TrainConfig:
     reference_nodes: int = 200_000
     """Nodes that ECBS may generate for a validation or test case before LaCAM plans it; take fewer for crowds."""
 
-    teacher: str = "ecbs"
+    expert: str = "ecbs"
     """The solver that shows the moves: "ecbs", "lacam", "prioritised", "pibt", or one of your own as
     "module:function"."""
     w: float = 1.05
-    """ECBS's cost is at most w times the lower bound of the optimum, where it teaches and where its plans set T_max;
-    other teachers are asked without a w."""
+    """ECBS's cost is at most w times the lower bound of the optimum, both for labels and for the plans that set T_max;
+    other solvers are called without a w."""
     robot_order: RobotOrder = "index"
-    """The order in which the teacher is given the robots of a state, by which solvers break ties: that of their
+    """The order in which the expert is given the robots of a state, by which solvers break ties: that of their
     numbers, "random" in each state, or by the Manhattan distance to their goals, "farthest" or "nearest" first."""
     expert_nodes: int = 2000
     """Nodes that ECBS or LaCAM may generate to label a state; unlabelled states are counted and left out."""
-    expert_rounds: int = 400
+    expert_iterations: int = 400
     """Rounds of the neighbourhood search that improves LaCAM's plans in an aggregation of "plans"; more rounds give
     cheaper plans and take longer."""
 
-    epochs: int = 150
+    rounds: int = 150
     """Rounds of collecting and fitting; round 0 imitates the expert, the others aggregate what the policy visits."""
-    updates_per_epoch: int | None = None
+    updates_per_round: int | None = None
     """Gradient steps in a round; without a number, one pass in which every demonstrated state is seen once."""
     batch_size: int = 64
     """Team states in a gradient step."""
     batch_robots: int | None = None
     """Robot states in a gradient step, for teams of mixed sizes: so many teams are drawn as have this number of robots
-    together, where their sizes allow it. Needs `updates_per_epoch`; `batch_size` is then not used."""
+    together, where their sizes allow it. Needs `updates_per_round`; `batch_size` is then not used."""
     demonstration_steps: int = 524_288
     """Team steps played in round 0, by the expert."""
     aggregation: Aggregation = "visited"
@@ -125,12 +125,12 @@ class TrainConfig:
     """How many of them share a process's rollout_teams; each has a seed of its own."""
     hard_case_mining: int = 1
     """Team steps played for each one that is labelled; teams that did not arrive in the round are labelled first."""
-    execution: Execution = Execution(sample="stuck")
+    execution: Execution = Execution(actions="stuck")
     """How the policy is executed; saved with the weights. Rollouts in training and validation play in the same way,
-    except for what `sample_rollouts` says."""
-    sample_rollouts: Sample = False
-    """Which moves of rollouts in training and validation are drawn from the softmax: those of no robot, of all robots,
-    or of robots that are "stuck"; or "fallback", as `Execution.sample` explains."""
+    except for `rollout_actions`."""
+    rollout_actions: Actions = "argmax"
+    """How robots choose their actions in rollouts of training and validation: "argmax", "sampled", "stuck" or
+    "fallback", as in `Execution.actions`."""
     augment: bool = False
     """Turn and reflect every demonstrated state at random."""
 
@@ -168,9 +168,9 @@ class TrainConfig:
         check_types(self)
         positive = (
             "num_agents train_maps validation_maps test_maps cases_per_map validation_cases_per_map timeout "
-            "reference_nodes expert_nodes epochs batch_size demonstration_steps dagger_steps fresh_window "
+            "reference_nodes expert_nodes rounds batch_size demonstration_steps dagger_steps fresh_window "
             "rollout_length rollout_teams plan_steps hard_case_mining collectors lr final_lr validate_every "
-            "expert_rounds stuck_weight"
+            "expert_iterations stuck_weight"
         )
         for name in positive.split():
             if not 0 < getattr(self, name) < math.inf:
@@ -187,10 +187,10 @@ class TrainConfig:
             raise ValueError(f"clip_norm must be positive and finite, got {self.clip_norm}")
         if self.kept_states is not None and self.kept_states < 1:
             raise ValueError(f"kept_states must be at least 1, got {self.kept_states}")
-        if self.batch_robots is not None and (self.batch_robots < 1 or self.updates_per_epoch is None):
+        if self.batch_robots is not None and (self.batch_robots < 1 or self.updates_per_round is None):
             raise ValueError(
-                f"batch_robots must be at least 1 and needs updates_per_epoch, got {self.batch_robots} and "
-                f"{self.updates_per_epoch}"
+                f"batch_robots must be at least 1 and needs updates_per_round, got {self.batch_robots} and "
+                f"{self.updates_per_round}"
             )
         for name in ("seed", "data_seed"):
             if getattr(self, name) >= 2**64:
@@ -199,13 +199,13 @@ class TrainConfig:
             raise ValueError(f'{self.collectors} collectors need processes of their own: backend "process"')
         if not 1 <= self.w < math.inf:
             raise ValueError(f"w must be at least 1 and finite, got {self.w}")
-        if self.updates_per_epoch is not None and self.updates_per_epoch < 1:
-            raise ValueError(f"updates_per_epoch must be at least 1, got {self.updates_per_epoch}")
+        if self.updates_per_round is not None and self.updates_per_round < 1:
+            raise ValueError(f"updates_per_round must be at least 1, got {self.updates_per_round}")
 
     @property
     def rollout_execution(self) -> Execution:
         """How teams play in training and validation."""
-        return replace(self.execution, sample=self.sample_rollouts)
+        return replace(self.execution, actions=self.rollout_actions)
 
     @property
     def case_families(self) -> tuple[Family, ...]:

@@ -24,10 +24,10 @@ from gnn_policy.cases import Cases
 from gnn_policy.config import Backend, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.execution import episode_noise
+from gnn_policy.labelling import Labeller
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
 from gnn_policy.ranks import Ranks
-from gnn_policy.teacher import Teacher
 from gnn_policy.team_env import ACTION, CASE, POSITIONS, STATE_KEYS, TeamEnv, states_of
 from mapf_env import Action, MapSet, States, perceive
 
@@ -41,9 +41,9 @@ class Mixture(TensorDictModuleBase):
     beta: torch.Tensor
     seed: torch.Tensor
 
-    def __init__(self, policy: DecentralizedPolicy, teacher: Teacher, config: TrainConfig, cases: Cases) -> None:
+    def __init__(self, policy: DecentralizedPolicy, labeller: Labeller, config: TrainConfig, cases: Cases) -> None:
         super().__init__()
-        self.policy, self.teacher, self.config = policy, teacher, config
+        self.policy, self.labeller, self.config = policy, labeller, config
         self._map_of = cases.map_of
         self._senses = config.rollout_execution.senses(config.policy)
         self._maps = MapSet(cases.grids, self._senses.fov_radius, "uint8")
@@ -70,12 +70,12 @@ class Mixture(TensorDictModuleBase):
         by_expert = (torch.rand(count, generator=self._random) < self.beta.cpu()).numpy()
         states = states_of(tensordict, self._map_of)
         scores = np.zeros((states.num_robots, len(Action)), np.float32)
-        taught = by_expert[states.team]
+        guided = by_expert[states.team]
         if not by_expert.all():
-            scores[~taught] = self._score(states.take(~by_expert))
+            scores[~guided] = self._score(states.take(~by_expert))
         if by_expert.any():
-            moves, _ = self.teacher.moves(states.take(by_expert))
-            scores[taught] = np.eye(len(Action), dtype=np.float32)[moves]
+            moves, _ = self.labeller.moves(states.take(by_expert))
+            scores[guided] = np.eye(len(Action), dtype=np.float32)[moves]
         sizes = np.diff(states.offsets)
         present = np.arange(tensordict[POSITIONS].shape[1]) < sizes[:, None]
         action = np.zeros((*present.shape, len(Action)), np.float32)
@@ -129,14 +129,14 @@ class Demonstrator:
         self,
         config: TrainConfig,
         policy: DecentralizedPolicy,
-        teacher: Teacher,
+        labeller: Labeller,
         cases: Cases,
         ranks: Ranks = Ranks(),
     ) -> None:
-        self._config, self._teacher, self._cases, self._map_of = config, teacher, cases, cases.map_of
+        self._config, self._labeller, self._cases, self._map_of = config, labeller, cases, cases.map_of
         self._rank, self._ranks = ranks.rank, ranks.count
         teams, players = teams_side_by_side(config, ranks), config.collectors
-        self._mixture = Mixture(policy, teacher, config, cases)
+        self._mixture = Mixture(policy, labeller, config, cases)
         self._mixture.begin(beta=1.0, seed=0)
         make_env = functools.partial(
             TeamEnv,
@@ -171,7 +171,7 @@ class Demonstrator:
         seed = int(np.random.SeedSequence([self._config.seed, round_number, self._rank]).generate_state(1)[0])
         if round_number == 0 and self._config.aggregation == "plans":
             starts = self._starts(steps, np.random.default_rng(seed))
-            return self._teacher.demonstrate(starts, self._config.plan_steps)
+            return self._labeller.demonstrate(starts, self._config.plan_steps)
         self._mixture.begin(self._config.beta_decay**round_number, seed)
         if self._config.backend != "direct":
             self._collector.update_policy_weights_(self._mixture)
@@ -189,14 +189,14 @@ class Demonstrator:
         chosen = played[torch.from_numpy(teams)].reshape(-1)
         if aggregation == "stuck":
             chosen = chosen[chosen["next", "truncated"][:, 0]]
-            return self._teacher.demonstrate(states_of(chosen, self._map_of))
+            return self._labeller.demonstrate(states_of(chosen, self._map_of))
         if aggregation == "plans":
             states = states_of(chosen, self._map_of)
             weight = np.where(np.logical_or.reduceat(states.stuck(), states.offsets[:-1]), config.stuck_weight, 1.0)
             count = max(len(states) // config.plan_steps, 1)
             asked = np.random.default_rng(seed).choice(len(states), count, replace=False, p=weight / weight.sum())
-            return self._teacher.demonstrate(states.take(np.sort(asked)), config.plan_steps)
-        return self._teacher.label(states_of(chosen, self._map_of))
+            return self._labeller.demonstrate(states.take(np.sort(asked)), config.plan_steps)
+        return self._labeller.label(states_of(chosen, self._map_of))
 
     def _starts(self, steps: int, rng: np.random.Generator) -> States:
         """Return the starts of as many cases as have plans of about so many steps."""

@@ -16,7 +16,7 @@ from mapf_env.config import Shield
 from mapf_env.hashing import mix
 from mapf_env.senses import CommRange, CommWeights
 
-Sample = Literal[False, True, "stuck", "fallback"]
+Actions = Literal["argmax", "sampled", "stuck", "fallback"]
 Seeds = npt.NDArray[np.uint64]
 Flags = npt.NDArray[np.bool_]
 Logits = npt.NDArray[np.float32]
@@ -32,14 +32,14 @@ class Execution:
         ValueError: If a field is none of its values.
     """
 
-    sample: Sample = False
-    """Draw a robot's move from the softmax instead of taking the most probable one: never, always, or while it or a
-    neighbour is "stuck": off its goal and back on a cell where it stood in one of its last 16 steps. "fallback": a
-    robot that is stuck itself prefers the moves that shorten its way, then to stay, as PIBT does, and draws among
-    equals; a robot that is jammed, on at most three cells in its last 16 steps, draws among all, those moves
-    preferred. That needs the map, and the shield "pibt_swap" makes the most of it."""
+    actions: Actions = "argmax"
+    """How a robot chooses its action. "argmax" takes the most probable one, "sampled" samples from the softmax. "stuck"
+    samples only while the robot or a neighbour is stuck, that is, off its goal and back on a cell of its last 16 steps.
+    "fallback": a robot that is stuck itself prefers actions that shorten its path, then staying, as PIBT does, and
+    breaks ties at random; a robot that is jammed (on at most three cells in its last 16 steps) samples among all
+    actions, with those preferred. "fallback" needs the map and works best with the shield "pibt_swap"."""
     temperature: float = 1.0
-    """Divides the logits where moves are drawn."""
+    """Divides the logits of robots that sample."""
     shield: Shield = "idle"
     """Collision shielding: "idle" is the paper's; "pibt" moves robots aside by priority and takes the logits as
     preferences."""
@@ -51,7 +51,7 @@ class Execution:
 
     def __post_init__(self) -> None:
         for name, known in (
-            ("sample", get_args(Sample)),
+            ("actions", get_args(Actions)),
             ("shield", get_args(Shield)),
             ("comm_range", (*get_args(CommRange), None)),
             ("comm_weights", (*get_args(CommWeights), None)),
@@ -61,7 +61,7 @@ class Execution:
         if not 0 < number(self.temperature, "temperature") < np.inf:
             raise ValueError(
                 f"temperature must be positive and finite, got {self.temperature}; "
-                "for the most probable move: sample=False"
+                'for the most probable action give actions="argmax"'
             )
 
     def scores(
@@ -79,7 +79,7 @@ class Execution:
 
         Args:
             logits: (M, 5) of robots.
-            alarmed: (M,) robots that are stuck or, unless for the fallback, hear a robot that is.
+            alarmed: (M,) robots that are stuck or, except for "fallback", hear a robot that is.
             noise: Returns Gumbel noise (m, 5) for the m robots that a mask (M,) selects.
             greedy: (M, 5) the moves that shorten each robot's way, which the fallback reads.
             jammed: (M,) robots that got nowhere for many steps, which the fallback reads.
@@ -92,7 +92,7 @@ class Execution:
                 "the policy's logits are not finite: its weights or what it observes are damaged, or its training "
                 "diverged; train it again with a smaller lr"
             )
-        draws = np.full_like(alarmed, self.sample) if isinstance(self.sample, bool) else alarmed
+        draws = {"argmax": np.zeros_like(alarmed), "sampled": np.ones_like(alarmed)}.get(self.actions, alarmed)
         if not draws.any():
             return logits
         scores = logits.copy()
@@ -100,7 +100,7 @@ class Execution:
             scores[draws] = logits[draws] / self.temperature + noise(draws)
         if not np.isfinite(scores).all():
             raise ValueError(f"the logits over a temperature of {self.temperature} are not finite: give a higher one")
-        if self.sample == "fallback":
+        if self.actions == "fallback":
             if greedy is None or jammed is None:
                 raise ValueError("the fallback needs each robot's greedy moves (M, 5) and which robots are jammed (M,)")
             tier = 2 * greedy[draws].astype(np.float32)
@@ -112,7 +112,7 @@ class Execution:
     @property
     def features(self) -> tuple[str, ...]:
         """The robot features that this way of execution reads itself."""
-        return {"stuck": ("stuck",), "fallback": ("greedy_moves", "jammed", "stuck")}.get(str(self.sample), ())
+        return {"stuck": ("stuck",), "fallback": ("greedy_moves", "jammed", "stuck")}.get(self.actions, ())
 
     def robot_features(self, policy: PolicyConfig) -> tuple[str, ...]:
         """Return what robots of `policy` know about themselves: what it reads, then what only the execution reads."""
@@ -134,8 +134,8 @@ class Execution:
     @property
     def name(self) -> str:
         """The execution in words that `parse` reads, such as "argmax" or "sampled,0.5,pibt"; no shield means "idle"."""
-        words = [_WORD_OF_SAMPLE[self.sample]]
-        if self.sample:
+        words: list[str] = [self.actions]
+        if self.actions != "argmax":
             words.append(f"{self.temperature:g}")
         words += [self.shield] if self.shield != "idle" else []
         return ",".join([*words, *(each for each in (self.comm_range, self.comm_weights) if each)])
@@ -157,20 +157,24 @@ class Execution:
             if option in given:
                 raise ValueError(f"the execution {text!r} says {option} twice: {given[option]} and {value}")
             given[option] = value
-        if "temperature" in given and not given.get("sample"):
+        if "temperature" in given and given.get("actions", "argmax") == "argmax":
             raise ValueError(
-                f"the execution {text!r} has a temperature but draws nothing: say sampled, stuck or fallback"
+                f"the execution {text!r} has a temperature but samples nothing: add sampled, stuck or fallback"
             )
-        return replace(Execution() if base is None else base, **{"sample": False, **given})
+        return replace(Execution() if base is None else base, **{"actions": "argmax", **given})
 
 
 _TIER, _JAMMED = np.float32(1000.0), np.float32(2.0)
 """What the scores of a move that shortens the way, of staying, and of other moves differ by: so much that no draw
 changes their order, or for a jammed robot so little that draws do."""
-_WORD_OF_SAMPLE = {False: "argmax", True: "sampled", "stuck": "stuck", "fallback": "fallback"}
-_OPTION_OF_WORD = {word: ("sample", sample) for sample, word in _WORD_OF_SAMPLE.items()} | {
+_OPTION_OF_WORD = {
     word: (option, word)
-    for option, words in (("shield", Shield), ("comm_range", CommRange), ("comm_weights", CommWeights))
+    for option, words in (
+        ("actions", Actions),
+        ("shield", Shield),
+        ("comm_range", CommRange),
+        ("comm_weights", CommWeights),
+    )
     for word in get_args(words)
 }
 

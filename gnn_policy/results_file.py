@@ -10,18 +10,19 @@ from typing import Any
 
 from gnn_policy.cases import Split, Task
 from gnn_policy.config import TrainConfig
-from gnn_policy.execution import Execution, Sample
+from gnn_policy.execution import Actions, Execution
 from mapf_env.files import write_whole
 
 
 def default_executions(execution: Execution) -> list[Execution]:
-    """Return the rows that are evaluated by default.
+    """Return the executions that are evaluated by default.
 
-    They are argmax, draws of stuck robots and draws of all; for a policy whose stuck robots fall back on their shortest
-    way, that and argmax.
+    They are "argmax", "stuck" and "sampled", or "fallback" and "argmax" for a policy with "fallback".
     """
-    samples: tuple[Sample, ...] = ("fallback", False) if execution.sample == "fallback" else (False, "stuck", True)
-    return [replace(execution, sample=sample) for sample in samples]
+    chosen: tuple[Actions, ...] = ("argmax", "stuck", "sampled")
+    if execution.actions == "fallback":
+        chosen = ("fallback", "argmax")
+    return [replace(execution, actions=actions) for actions in chosen]
 
 
 def settings_of(

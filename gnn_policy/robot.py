@@ -146,7 +146,7 @@ class Robot:
         own = np.asarray(scalars, np.float32)
         if own.ndim != 1 or not np.isfinite(own).all():
             raise ValueError(f"scalars must be a row of finite numbers, got {own.tolist()}")
-        if self._execution.sample == "fallback":
+        if self._execution.actions == "fallback":
             self._greedy = facts_of(own[None], self._policy.config, self._execution)["greedy_moves"]
         with torch.inference_mode():
             extracted = self._policy.extract(self._tensor(view)[None], self._tensor(own)[None])
@@ -189,7 +189,7 @@ class Robot:
                 raise ValueError(
                     f"{name!r} sent features that are not finite: leave the message out as if it were lost"
                 )
-            self._alarmed |= message.stuck and self._execution.sample == "stuck"
+            self._alarmed |= message.stuck and self._execution.actions == "stuck"
         names = [name for name in self._weights if name in messages]  # in the links' order, as the network sums them
         heard = np.array([messages[name].features for name in names], np.float32).reshape(len(names), *size)
         with torch.inference_mode():

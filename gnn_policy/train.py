@@ -127,11 +127,11 @@ def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) ->
     from gnn_policy.progress import TrainingProgress
     from gnn_policy.training import Training
 
-    progress = TrainingProgress(config.epochs, console)
+    progress = TrainingProgress(config.rounds, console)
     training = Training(config, folder, progress, ranks)
     console.print(f"run folder: {folder}", highlight=False)
     if training.history:
-        console.print(f"goes on after round {len(training.history)} of {config.epochs}", highlight=False)
+        console.print(f"goes on after round {len(training.history)} of {config.rounds}", highlight=False)
     with training.lock:
         try:
             with progress:

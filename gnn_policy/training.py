@@ -43,6 +43,7 @@ from gnn_policy.demonstrations import BatchMaker, Demonstrations, Filler, Parts
 from gnn_policy.finite import require_finite
 from gnn_policy.half_batches import HalfBatches
 from gnn_policy.imitation import EXPERT_ACTION, ImitationLoss
+from gnn_policy.labelling import Labeller
 from gnn_policy.learning_curve import Round, draw_learning_curve
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
@@ -50,7 +51,6 @@ from gnn_policy.progress import TrainingProgress
 from gnn_policy.ranks import Ranks
 from gnn_policy.rollout import rollout
 from gnn_policy.run_folder import lock_run, open_run
-from gnn_policy.teacher import Teacher
 from mapf_env.files import replacing
 
 
@@ -106,19 +106,19 @@ class Training:
             weight_decay=config.weight_decay,
             fused=True,
         )
-        self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.epochs, config.final_lr)
+        self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, config.rounds, config.final_lr)
         self.history: list[Round] = []
         self._seconds_before = 0.0
         self._clock, self._began = clock, clock()
         self._cases = config.cases("train")
         self._validation = config.cases("validation").instances
-        self._teacher = Teacher(
+        self._labeller = Labeller(
             self._cases.grids,
-            solver=config.teacher,
+            solver=config.expert,
             w=config.w,
             robot_order=config.robot_order,
             node_limit=config.expert_nodes,
-            rounds=config.expert_rounds,
+            rounds=config.expert_iterations,
             threads=self.threads,
             clock=clock,
         )
@@ -146,12 +146,12 @@ class Training:
         config, first = self.config, self.ranks.rank == 0
         reference = self._reference_set() if first else None
         batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
-        demonstrator = Demonstrator(config, self._player, self._teacher, self._cases, self.ranks)
+        demonstrator = Demonstrator(config, self._player, self._labeller, self._cases, self.ranks)
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
-            for number in range(len(self.history), config.epochs):
+            for number in range(len(self.history), config.rounds):
                 row = self._round(number, demonstrator, batches, reference)
                 self.history.append(row)
                 if writer is not None:
@@ -184,7 +184,7 @@ class Training:
         self, number: int, demonstrator: Demonstrator, batches: BatchMaker, reference: metrics.ReferenceSet | None
     ) -> Round:
         config = self.config
-        began, taught, unlabelled = self._clock(), self._teacher.seconds, 0
+        began, expert_seconds, unlabelled = self._clock(), self._labeller.seconds, 0
         if self._collects(number):
             self.progress.phase(number, "collecting")
             steps = config.dagger_steps if number else config.demonstration_steps
@@ -216,7 +216,7 @@ class Training:
             samples=samples + (previous.samples if previous else 0),
             seconds=0.0,
             collect_seconds=between - began,
-            expert_seconds=self._teacher.seconds - taught,
+            expert_seconds=self._labeller.seconds - expert_seconds,
             fit_seconds=done - between,
             loss=loss,
             accuracy=accuracy,
@@ -224,7 +224,7 @@ class Training:
             demonstrations=len(demonstrations),
             unlabelled=unlabelled,
         )
-        if reference is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.epochs):
+        if reference is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.rounds):
             self.progress.phase(number, "validation")
             self._validate(row, reference)
         row.seconds = self._seconds_before + self._clock() - self._began
@@ -310,7 +310,7 @@ class Training:
         if any were aggregated since round 0.
         """
         config, size, parts = self.config, len(demonstrations), 1 if self._halves is None else 2
-        if config.updates_per_epoch is None:
+        if config.updates_per_round is None:
             order = rng.permutation(size)
             batches = np.array_split(order, -(-size // config.batch_size))
             return [self._divide(batch, parts) for batch in batches]
@@ -319,11 +319,11 @@ class Training:
         if config.batch_robots is None:
             fresh = round(config.fresh_share * config.batch_size)
             first = np.repeat([newest, 0], [fresh, config.batch_size - fresh])
-            batches = rng.integers(first, size, (config.updates_per_epoch, config.batch_size))
+            batches = rng.integers(first, size, (config.updates_per_round, config.batch_size))
             return [self._divide(batch, parts) for batch in batches]
         fill = Filler(np.diff(demonstrations.states.offsets), newest, config.fresh_share, rng)
         pieces = parts * self.ranks.count
-        drawn = [[fill(config.batch_robots // pieces) for _ in range(pieces)] for _ in range(config.updates_per_epoch)]
+        drawn = [[fill(config.batch_robots // pieces) for _ in range(pieces)] for _ in range(config.updates_per_round)]
         return [batch[self.ranks.rank :: self.ranks.count] for batch in drawn]
 
     def _divide(self, batch: npt.NDArray[np.intp], parts: int) -> Parts:

@@ -13,7 +13,7 @@ import pytest
 
 SETTINGS = """
     --policy.features 16 --num-agents 3 --height 8 --width 8 --train-maps 30 --cases-per-map 4 --validation-maps 4
-    --validation-cases-per-map 3 --test-maps 5 --epochs 4 --updates-per-epoch 60 --batch-size 32
+    --validation-cases-per-map 3 --test-maps 5 --rounds 4 --updates-per-round 60 --batch-size 32
     --demonstration-steps 1024 --dagger-steps 256 --rollout-teams 16 --rollout-length 16 --validate-every 2 --threads 1
 """
 

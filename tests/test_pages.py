@@ -68,7 +68,7 @@ def carry_out(line: str) -> None:
         case ["python", "-m", "gnn_policy.evaluate", *options]:
             evaluate.main([*options, "--threads", "1"])
         case ["python", "-m", "gnn_policy.train", *options]:
-            if train.parse(options).config.epochs <= 2:
+            if train.parse(options).config.rounds <= 2:
                 train.main([*options, "--threads", "1"])
         case ["python", "benchmarks/report.py", *options]:
             subprocess.run([sys.executable, str(ROOT / "benchmarks" / "report.py"), *options], check=True, timeout=120)

@@ -72,7 +72,7 @@ def test_finished_runs_are_not_repeated_and_the_table_has_them_all(
 
 def test_runs_of_other_settings_are_no_part_of_the_table(ablation: ModuleType, tmp_path: Path) -> None:
     ablation.main(ablation.Options("dagger", tmp_path, only=("none",), updates=1))
-    with pytest.raises(FileExistsError, match=r"none-seed-0 holds a run of other settings \(updates_per_epoch\)"):
+    with pytest.raises(FileExistsError, match=r"none-seed-0 holds a run of other settings \(updates_per_round\)"):
         ablation.main(ablation.Options("dagger", tmp_path, only=("default",), updates=2))
     with pytest.raises(ValueError, match="--seeds must be at least 1, got 0"):
         ablation.main(ablation.Options("dagger", tmp_path, seeds=0))

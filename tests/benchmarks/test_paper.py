@@ -43,7 +43,7 @@ def experiment(folder: Path, **changes: object):
 def finish(whole, model, success: float = 0.5) -> None:
     """Write what a training and a test of the model leave."""
     whole.run_of(model).mkdir(parents=True)
-    (whole.run_of(model) / "metrics.csv").write_text("a round\n" * (1 + model.config.epochs))
+    (whole.run_of(model) / "metrics.csv").write_text("a round\n" * (1 + model.config.rounds))
     estimate = {"mean": success, "low": success - 0.1, "high": success + 0.1}
     measures = ("success_rate", "flowtime_increase", "flowtime_increase_solved", "makespan")
     folder = whole.result(Scene("cells", model.num_agents), model.name).parent
@@ -87,7 +87,7 @@ def test_rounds_have_equally_many_robot_states_for_every_size_of_the_team():
 
 
 def test_only_what_is_missing_is_trained_and_a_training_that_was_stopped_goes_on(tmp_path, monkeypatch):
-    shorter = replace(CONFIG, epochs=2)
+    shorter = replace(CONFIG, rounds=2)
     monkeypatch.setitem(RECIPES, "full", shorter)
     whole = experiment(tmp_path, taps=(3,))
     finish(whole, Model(4, 3))
@@ -105,7 +105,7 @@ def test_only_what_is_missing_is_trained_and_a_training_that_was_stopped_goes_on
 
 
 def test_models_are_tested_once_and_results_of_other_settings_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setitem(RECIPES, "full", replace(CONFIG, epochs=1, dagger_every=0))
+    monkeypatch.setitem(RECIPES, "full", replace(CONFIG, rounds=1, dagger_every=0))
     options = {"taps": (3,), "train_on": (4,)}
     whole, console = experiment(tmp_path, **options), Console(quiet=True)
     paper.train(whole, console)
@@ -157,8 +157,8 @@ def test_a_model_of_other_settings_is_refused(tmp_path, monkeypatch):
     for action in (whole.untrained, lambda: whole.policy_of(Model(4, 3))):
         with pytest.raises(FileExistsError, match=r"n4-k3 holds a model of other settings \(density\)"):
             action()
-    monkeypatch.setitem(RECIPES, "full", replace(RECIPES["full"], epochs=7))
-    with pytest.raises(FileExistsError, match=r"n12\.safetensors holds a model of other settings \(epochs\)"):
+    monkeypatch.setitem(RECIPES, "full", replace(RECIPES["full"], rounds=7))
+    with pytest.raises(FileExistsError, match=r"n12\.safetensors holds a model of other settings \(rounds\)"):
         experiment(tmp_path, packaged=True).policy_of(Model(12, 3))
 
 
@@ -180,7 +180,7 @@ def test_a_pair_that_another_process_tested_meanwhile_is_left_as_it_is(tmp_path,
 
 
 def test_a_model_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(RECIPES, "full", replace(CONFIG, epochs=1))
+    monkeypatch.setitem(RECIPES, "full", replace(CONFIG, rounds=1))
     whole = experiment(tmp_path, taps=(3,))
     lock = lock_run(whole.run_of(Model(4, 3)))
     paper.train(whole, Console(quiet=True))

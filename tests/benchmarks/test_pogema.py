@@ -245,7 +245,7 @@ def test_a_policy_is_known_by_its_weights_and_played_as_by_rollout(folder: Path,
     assert pogema_methods.method_named("n12-informed,argmax").name == "n12-informed argmax,pibt", "trained under PIBT"
     instances = [case.instance for case in only_set(folder).cases(2)][:2]
     played = by_name.play(instances, 20, 3)
-    expected = rollout(load("n4"), instances, execution=Execution(sample="stuck"), seed=3, max_steps=20)
+    expected = rollout(load("n4"), instances, execution=Execution(actions="stuck"), seed=3, max_steps=20)
     assert played.success.tolist() == expected.success.tolist()
     assert played.flowtime.tolist() == expected.flowtime.tolist()
 
@@ -267,7 +267,9 @@ def test_plans_are_judged_as_rollouts_are() -> None:
     grid = parse_map("....\n....")
     instances = [Instance(grid, [(0, 0), (1, 3)], [(0, 3), (1, 0)]), Instance(grid, [(0, 0), (0, 1)], [(0, 1), (0, 0)])]
     for max_steps in (1, 2, 3, 30):
-        played: Rollouts = rollout(load("n4"), instances, execution=Execution(sample=True), seed=5, max_steps=max_steps)
+        played: Rollouts = rollout(
+            load("n4"), instances, execution=Execution(actions="sampled"), seed=5, max_steps=max_steps
+        )
         judged = pogema_methods.judge(instances, [each.paths for each in played.solutions], max_steps)
         assert judged.success.tolist() == played.success.tolist()
         assert judged.flowtime.tolist() == played.flowtime.tolist()

@@ -205,7 +205,7 @@ def test_a_bag_without_robots_has_no_moves():
 
 
 def test_draws_follow_the_tempered_softmax_and_repeat_with_the_seed():
-    execution = Execution(sample=True, temperature=2.0)
+    execution = Execution(actions="sampled", temperature=2.0)
     policy = seeded_policy(execution=execution)
     env, observation = played(policy)
     logits = of_network(policy, env.bag()) / 2
@@ -225,7 +225,7 @@ def test_draws_follow_the_tempered_softmax_and_repeat_with_the_seed():
 def test_robots_draw_when_they_are_stuck_or_hear_one_that_is(taps, knows):
     """A policy may read itself whether a robot is stuck; otherwise the environment adds that at the end."""
     own = ("stuck", "on_goal") if knows else ("on_goal",)
-    execution = Execution(sample="stuck", temperature=1e6)
+    execution = Execution(actions="stuck", temperature=1e6)
     policy = seeded_policy(execution=execution, taps=taps, robot_features=own, comm_radius=1.5)
     env, observation = played(policy, steps=1)
     bag, states = env.bag(), env.states()
@@ -244,7 +244,7 @@ def test_robots_draw_when_they_are_stuck_or_hear_one_that_is(taps, knows):
 
 @pytest.mark.parametrize("own", [(), ("stuck", "jammed", "on_goal", "greedy_moves")])
 def test_robots_that_are_stuck_fall_back_on_their_shortest_way_and_those_that_hear_them_do_not(own):
-    execution = Execution(sample="fallback", temperature=0.5, shield="pibt_swap")
+    execution = Execution(actions="fallback", temperature=0.5, shield="pibt_swap")
     policy = seeded_policy(execution=execution, robot_features=own, comm_radius=1.5)
     env, observation = played(policy, steps=1)
     bag, states = env.bag(), env.states()
@@ -264,7 +264,7 @@ def test_robots_that_are_stuck_fall_back_on_their_shortest_way_and_those_that_he
 
 
 def test_stuck_robots_of_a_dictionary_draw():
-    policy = seeded_policy(execution=Execution(sample="stuck", temperature=1e6), comm_radius=0.0)
+    policy = seeded_policy(execution=Execution(actions="stuck", temperature=1e6), comm_radius=0.0)
     instance = Instance(np.zeros((1, 4), bool), [[0, 0], [0, 3]], [[0, 3], [0, 1]])
     env = parallel_env(num_agents=2, height=1, width=4, density=0.0, **policy.env_settings())
     env.reset(seed=0, options={"instance": instance})
@@ -285,7 +285,7 @@ def test_the_policy_is_left_in_the_mode_that_it_was_in(training):
 
 
 def test_what_cannot_be_acted_on_is_refused_with_the_way_out():
-    policy = seeded_policy(execution=Execution(sample="stuck"))
+    policy = seeded_policy(execution=Execution(actions="stuck"))
     settings = {"num_agents": 3, "height": 6, "width": 6, "fov_radius": 2}
     seen, _ = parallel_env(**settings).reset(seed=0)
     with pytest.raises(ValueError, match=r"stuck,1 reads stuck, which .* not say: .*\*\*policy.env_settings\(\)"):

@@ -22,7 +22,9 @@ from own_layers import Deaf
 
 CONFIG = PolicyConfig(encoder="lean", features=8, taps=2, fov_radius=3, comm_radius=4.5)
 
-EXECUTION = Execution(sample=True, temperature=0.5, shield="pibt", comm_range="connected", comm_weights="distance")
+EXECUTION = Execution(
+    actions="sampled", temperature=0.5, shield="pibt", comm_range="connected", comm_weights="distance"
+)
 
 
 @pytest.fixture
@@ -395,8 +397,8 @@ def test_the_packaged_policies_say_how_they_are_executed():
         trained, execution = checkpoint.trained_with(file), checkpoint.executed_as(file)
         assert load(file).execution == execution
         assert execution == {
-            "general": Execution(sample="fallback", temperature=1.5, shield="pibt_swap"),
-            "n12-informed": Execution(sample="stuck", shield="pibt"),
-        }.get(file.stem, Execution(sample="stuck"))
+            "general": Execution(actions="fallback", temperature=1.5, shield="pibt_swap"),
+            "n12-informed": Execution(actions="stuck", shield="pibt"),
+        }.get(file.stem, Execution(actions="stuck"))
         assert trained.execution == execution
         assert trained.policy == load(file).config

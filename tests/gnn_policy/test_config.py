@@ -28,7 +28,7 @@ from small_training import CONFIG, MIXED
         ("timeout", 3.0),
         ("lr", 1e-3),
         ("final_lr", 1e-6),
-        ("epochs", 150),
+        ("rounds", 150),
         ("batch_size", 64),
         ("weight_decay", 1e-5),
         ("beta1", 0.9),
@@ -48,7 +48,7 @@ def test_the_paper_recipe_has_the_papers_network(name, value):
 
 
 def test_an_epoch_of_the_paper_is_a_pass_over_the_data():
-    assert RECIPES["paper"].updates_per_epoch is None
+    assert RECIPES["paper"].updates_per_round is None
 
 
 EXAMPLES = {
@@ -64,17 +64,19 @@ EXAMPLES = {
             graph_layer="attention",
             memory=3,
         ),
-        execution=Execution(sample=True, temperature=0.1 + 0.2, shield="pibt", comm_range="connected"),
-        sample_rollouts="stuck",
+        execution=Execution(actions="sampled", temperature=0.1 + 0.2, shield="pibt", comm_range="connected"),
+        rollout_actions="stuck",
         styles=("walls", "maze"),
         files=('C:\\maps\\"odd" ü.map', "two"),
         init="n12",
         lr=3e-4,
         seed=2**40,
-        updates_per_epoch=None,
+        updates_per_round=None,
     ),
     "families": MIXED,
-    "sample": replace(TrainConfig(), sample_rollouts=True, execution=Execution(sample=False), weight_decay=1e-300),
+    "argmax": replace(
+        TrainConfig(), rollout_actions="sampled", execution=Execution(actions="argmax"), weight_decay=1e-300
+    ),
 }
 
 
@@ -108,7 +110,7 @@ def test_any_numbers_and_texts_return_from_toml(lr, density, radius, seed, share
 def test_a_file_that_a_person_writes_needs_only_what_differs_from_the_defaults(tmp_path):
     (tmp_path / "mine.toml").write_text(
         """
-        epochs = 7
+        rounds = 7
         lr = 1
         [policy]
         taps = 2
@@ -126,10 +128,10 @@ def test_a_file_that_a_person_writes_needs_only_what_differs_from_the_defaults(t
         """
     )
     assert TrainConfig.load(tmp_path / "mine.toml") == TrainConfig(
-        epochs=7,
+        rounds=7,
         lr=1,
         policy=PolicyConfig(taps=2, extra_channels=("cost_to_go",)),
-        execution=Execution(sample="stuck", shield="pibt"),
+        execution=Execution(actions="stuck", shield="pibt"),
         families=(
             Family(style="maze", height=(10, 30), corridor_width=(1, 3)),
             Family(share=2, num_agents=(4, 40), density=(0, 0.3)),
@@ -142,16 +144,16 @@ def test_a_file_that_a_person_writes_needs_only_what_differs_from_the_defaults(t
     "damaged",
     [
         "{",
-        "epochs = ",
-        "epochs = 1\nepochs = 2",
+        "rounds = ",
+        "rounds = 1\nepochs = 2",
         "policy = 1",
         "execution = []",
         "families = 3",
         "families = [1]",
         "[families]\nstyle = 'maze'",
-        "epochs = '7'",
-        "epochs = 7.5",
-        "epochs = true",
+        "rounds = '7'",
+        "rounds = 7.5",
+        "rounds = true",
         "files = 'own.map'",
         "[policy]\ntaps = 0",
         "[execution]\nshield = 'none'",
@@ -170,7 +172,7 @@ def test_damaged_settings_name_their_file_in_one_line(tmp_path, damaged):
 @pytest.mark.parametrize(
     ("text", "listed"),
     [
-        ("epoch = 1", ("'epoch'", "epochs", "families", "num_agents")),
+        ("round = 1", ("'round'", "rounds", "families", "num_agents")),
         ("[policy]\ntap = 1", ("'tap'", "taps", "extra_channels", "comm_radius")),
         ("[execution]\nshields = 'pibt'", ("'shields'", "shield", "temperature")),
         ("[[families]]\nsize = [1, 2]", ("'size'", "height", "width", "share")),
@@ -185,10 +187,10 @@ def test_an_unknown_setting_is_named_with_all_that_there_are(text, listed):
 
 
 def test_rollouts_of_training_play_as_the_policy_is_executed_except_for_their_draws():
-    config = TrainConfig(execution=Execution(sample="stuck", temperature=0.5, shield="pibt", comm_range="connected"))
-    assert config.rollout_execution == replace(config.execution, sample=False)
-    for sample in (True, "stuck"):
-        assert replace(config, sample_rollouts=sample).rollout_execution == replace(config.execution, sample=sample)
+    config = TrainConfig(execution=Execution(actions="stuck", temperature=0.5, shield="pibt", comm_range="connected"))
+    assert config.rollout_execution == replace(config.execution, actions="argmax")
+    for actions in ("sampled", "stuck"):
+        assert replace(config, rollout_actions=actions).rollout_execution == replace(config.execution, actions=actions)
 
 
 def test_settings_of_one_family_are_its_ranges_and_families_replace_them():
@@ -231,8 +233,8 @@ WRONG = {
     "cases_per_map": 0,
     "validation_cases_per_map": 0,
     "expert_nodes": 0,
-    "epochs": 0,
-    "updates_per_epoch": 0,
+    "rounds": 0,
+    "updates_per_round": 0,
     "batch_size": 0,
     "demonstration_steps": 0,
     "dagger_every": -1,
@@ -246,7 +248,7 @@ WRONG = {
     "rollout_teams": 0,
     "beta1": 2.0,
     "weight_decay": -1.0,
-    "sample_rollouts": "always",
+    "rollout_actions": "always",
     "validate_every": 0,
     "seed": -1,
     "data_seed": -1,

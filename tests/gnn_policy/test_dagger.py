@@ -16,7 +16,7 @@ from gnn_policy.cases import Family, make_cases
 from gnn_policy.config import TrainConfig
 from gnn_policy.dagger import Demonstrator, Mixture
 from gnn_policy.demonstrations import BatchMaker
-from gnn_policy.teacher import Teacher
+from gnn_policy.labelling import Labeller
 from gnn_policy.team_env import ACTION, CASE, POSITIONS, TeamEnv
 from mapf_env import Action, Bag, Instance
 
@@ -65,13 +65,13 @@ def idle_policy(policy):
     return policy
 
 
-def taught_by(cases, **settings):
-    return Teacher(cases.grids, **{"w": 1.05, "node_limit": 2000, "threads": 1, **settings})
+def labeller_for(cases, **settings):
+    return Labeller(cases.grids, **{"w": 1.05, "node_limit": 2000, "threads": 1, **settings})
 
 
 def demonstrating(config, policy, cases):
-    teacher = taught_by(cases, solver=config.teacher, robot_order=config.robot_order)
-    return Demonstrator(config, policy, teacher, cases)
+    labeller = labeller_for(cases, solver=config.expert, robot_order=config.robot_order)
+    return Demonstrator(config, policy, labeller, cases)
 
 
 def collected(config, policy, cases, number, steps):
@@ -144,7 +144,7 @@ def test_round_zero_is_the_expert_itself(kind, cases, mixed, policy):
 def test_every_team_reaches_its_goals_under_the_expert(kind, cases, mixed, policy, shield):
     played = {"alike": cases, "mixed": mixed}[kind]
     config = replace(CONFIG, execution=Execution(shield=shield))
-    mixture = Mixture(policy, taught_by(played), config, played)
+    mixture = Mixture(policy, labeller_for(played), config, played)
     settings = config.rollout_execution.env_settings(config.policy)
     env = TeamEnv(len(played), played.instances, observation="state", max_cycles=60, dtype="uint8", **settings)
     state, reached = env.reset(seed=0), set()
@@ -190,9 +190,9 @@ def assert_equal(one, other):
     assert np.array_equal(one.actions, other.actions)
 
 
-@pytest.mark.parametrize("sample", [False, True, "stuck"])
-def test_a_round_depends_on_seed_number_and_weights_alone(cases, policy, sample):
-    config = replace(CONFIG, sample_rollouts=sample, beta_decay=0.6)
+@pytest.mark.parametrize("actions", ["argmax", "sampled", "stuck"])
+def test_a_round_depends_on_seed_number_and_weights_alone(cases, policy, actions):
+    config = replace(CONFIG, rollout_actions=actions, beta_decay=0.6)
     demonstrator = demonstrating(config, policy, cases)
     rounds = {number: demonstrator.collect(number, 100)[0] for number in (0, 1, 2)}
     demonstrator.close()
@@ -243,7 +243,7 @@ def states_at_starts(cases, teams, **settings):
 
 @pytest.mark.parametrize("beta", [0.0, 0.3, 1.0])
 def test_a_team_follows_the_expert_with_probability_beta(cases, idle_policy, beta):
-    mixture = Mixture(idle_policy.eval(), taught_by(cases), CONFIG, cases)
+    mixture = Mixture(idle_policy.eval(), labeller_for(cases), CONFIG, cases)
     mixture.begin(beta, seed=0)
     state = states_at_starts(cases, 2000)
     moves = mixture(state)[ACTION].numpy()
@@ -260,8 +260,8 @@ def one_case(cases):
 
 
 def test_sampled_moves_follow_the_softmax(cases, policy):
-    single, config = one_case(cases), replace(CONFIG, sample_rollouts=True, precision="float32")
-    mixture = Mixture(policy.eval(), taught_by(cases), config, single)
+    single, config = one_case(cases), replace(CONFIG, rollout_actions="sampled", precision="float32")
+    mixture = Mixture(policy.eval(), labeller_for(cases), config, single)
     mixture.begin(beta=0.0, seed=0)
     moves = mixture(states_at_starts(single, 4000))[ACTION].numpy()
     with torch.no_grad():
@@ -275,7 +275,7 @@ def test_sampled_moves_follow_the_softmax(cases, policy):
 def test_under_pibt_the_policys_scores_are_its_logits(kind, shield, cases, mixed, policy):
     played = {"alike": cases, "mixed": mixed}[kind]
     config = replace(CONFIG, execution=Execution(shield=shield), precision="float32")
-    mixture = Mixture(policy.eval(), taught_by(played), config, played)
+    mixture = Mixture(policy.eval(), labeller_for(played), config, played)
     mixture.begin(beta=0.0, seed=0)
     state = states_at_starts(played, 8, shield=shield)
     scores = mixture(state)[ACTION]
@@ -404,7 +404,7 @@ def test_round_zero_imitates_whatever_is_aggregated_later(cases, policy):
 
 
 def test_weights_seed_and_beta_of_a_round_reach_the_collectors_processes(cases, policy):
-    settings = replace(CONFIG, rollout_teams=4, backend="process", sample_rollouts=True)
+    settings = replace(CONFIG, rollout_teams=4, backend="process", rollout_actions="sampled")
 
     def biased(action):
         with torch.no_grad():
@@ -452,7 +452,7 @@ def test_teams_are_shared_evenly_by_collectors(cases, policy):
 
 
 def test_the_mixture_reads_what_the_environment_writes(policy, cases):
-    mixture = Mixture(policy, taught_by(cases), CONFIG, cases)
+    mixture = Mixture(policy, labeller_for(cases), CONFIG, cases)
     state = TeamEnv(2, cases.instances, observation="state").reset()
     assert isinstance(state, TensorDict)
     assert set(mixture.in_keys) <= set(state.keys(include_nested=True))

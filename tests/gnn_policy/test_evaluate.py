@@ -58,7 +58,7 @@ def test_the_help_names_every_option(capsys, monkeypatch):
         evaluate.main(["--help"])
     text = capsys.readouterr().out
     for each in fields(evaluate.Command):
-        assert (f"--{each.name.replace('_', '-')}" if each.name != "run" else "RUN") in text, each.name
+        assert (f"--{each.name.replace('_', '-')}" if each.name != "policy" else "POLICY") in text, each.name
     assert "Random seed for sampling and for the shield's tie-breaking" in text
 
 
@@ -67,20 +67,20 @@ def test_what_is_not_given_is_as_in_training(file, monkeypatch):
     assert config == CONFIG
     assert how["num_agents"] == ()
     assert how["split"] == "test"
-    assert how["executions"] == [Execution(), Execution(sample="stuck"), Execution(sample=True)]
+    assert how["executions"] == [Execution(), Execution(actions="stuck"), Execution(actions="sampled")]
     assert folder == file.parent / "evaluation"
 
 
 def test_rows_play_under_the_shield_that_the_policys_file_says(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     _, folder, how = evaluated(monkeypatch, "n12-informed", "--executions", "argmax", "stuck,idle")
-    assert how["executions"] == [Execution(shield="pibt"), Execution(sample="stuck")]
+    assert how["executions"] == [Execution(shield="pibt"), Execution(actions="stuck")]
     assert str(folder) == "evaluation/n12-informed"
     _, folder, how = evaluated(monkeypatch, "--executions", "argmax")
     assert how["executions"] == [Execution(shield="pibt_swap", temperature=1.5)]
     assert str(folder) == "evaluation/general"
     _, _, how = evaluated(monkeypatch)
-    assert [each.sample for each in how["executions"]] == ["fallback", False]
+    assert [each.actions for each in how["executions"]] == ["fallback", "argmax"]
 
 
 @pytest.mark.parametrize("split", ["test", "validation"])
@@ -96,7 +96,7 @@ def test_every_option_reaches_the_evaluation(file, monkeypatch, tmp_path, split)
     )
     assert how == {
         "num_agents": (2, 5),
-        "executions": [Execution(sample="stuck", temperature=0.5), Execution(shield="pibt", comm_range="connected")],
+        "executions": [Execution(actions="stuck", temperature=0.5), Execution(shield="pibt", comm_range="connected")],
         "split": split,
         "task": "one_shot",
         "steps": 256,
@@ -123,14 +123,14 @@ def test_it_writes_numbers_and_an_animation(file, capsys):
 
 
 def test_the_rows_of_a_policy_are_its_own_execution_drawn_in_three_ways(file, monkeypatch):
-    execution = Execution(sample=True, temperature=0.5, shield="pibt", comm_weights="distance")
+    execution = Execution(actions="sampled", temperature=0.5, shield="pibt", comm_weights="distance")
     save(DecentralizedPolicy(CONFIG.policy, execution), file, training=CONFIG.to_toml())
     _, _, how = evaluated(monkeypatch, str(file))
-    assert how["executions"] == [replace(execution, sample=sample) for sample in (False, "stuck", True)]
+    assert how["executions"] == [replace(execution, actions=actions) for actions in ("argmax", "stuck", "sampled")]
     _, _, how = evaluated(monkeypatch, str(file), "--executions", "stuck")
-    assert how["executions"] == [replace(execution, sample="stuck")]
+    assert how["executions"] == [replace(execution, actions="stuck")]
     _, _, how = evaluated(monkeypatch, str(file), "--executions", "stuck,1,idle,binary")
-    assert how["executions"] == [Execution(sample="stuck", comm_weights="binary")]
+    assert how["executions"] == [Execution(actions="stuck", comm_weights="binary")]
 
 
 def test_families_of_training_have_a_table_each_unless_a_map_is_asked_for(file, monkeypatch, capsys):
@@ -210,7 +210,7 @@ def test_evaluation_loads_neither_the_training_loop_nor_torchrl(file):
         "import sys\n"
         "from gnn_policy import evaluate\n"
         f"evaluate.main([{str(file)!r}, '--threads', '1', '--maps', '1', '--cases-per-map', '1'])\n"
-        "training = {'training', 'dagger', 'teacher', 'demonstrations', 'imitation', 'team_env', 'half_batches'}\n"
+        "training = {'training', 'dagger', 'labelling', 'demonstrations', 'imitation', 'team_env', 'half_batches'}\n"
         "heavy = {'torchrl', 'tensorboard', *(f'gnn_policy.{name}' for name in training)}\n"
         "print(sorted(heavy & sys.modules.keys()))\n"
     )

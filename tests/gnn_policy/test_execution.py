@@ -15,7 +15,7 @@ from mapf_env import HISTORY, BatchedEnv, EnvConfig, Instance, Senses
 
 EXECUTIONS = st.builds(
     Execution,
-    sample=st.sampled_from([False, True, "stuck", "fallback"]),
+    actions=st.sampled_from(["argmax", "sampled", "stuck", "fallback"]),
     temperature=st.sampled_from([0.3, 1.0, 2.5]),
     shield=st.sampled_from(["idle", "pibt", "pibt_swap"]),
     comm_range=st.sampled_from(["fixed", "connected", None]),
@@ -29,16 +29,16 @@ def test_names_round_trip_with_their_words_in_any_order(execution, random):
     random.shuffle(words)
     again = Execution.parse(",".join(words))
     assert again.name == execution.name
-    if execution.sample:
+    if execution.actions != "argmax":
         assert again == execution
 
 
 def test_a_name_without_a_shield_has_the_one_that_is_given():
-    assert Execution.parse("stuck", Execution(shield="pibt", temperature=0.5, sample=True)) == Execution(
-        sample="stuck", shield="pibt", temperature=0.5
+    assert Execution.parse("stuck", Execution(shield="pibt", temperature=0.5, actions="sampled")) == Execution(
+        actions="stuck", shield="pibt", temperature=0.5
     )
-    assert Execution.parse("stuck,idle", Execution(shield="pibt")) == Execution(sample="stuck")
-    assert Execution.parse("stuck") == Execution(sample="stuck")
+    assert Execution.parse("stuck,idle", Execution(shield="pibt")) == Execution(actions="stuck")
+    assert Execution.parse("stuck") == Execution(actions="stuck")
 
 
 def test_different_variants_have_different_names():
@@ -46,12 +46,12 @@ def test_different_variants_have_different_names():
         *([False, True, "stuck", "fallback"], [0.5, 1.0], ["idle", "pibt", "pibt_swap"]),
         *(["fixed", "connected", None], ["binary", "distance", None]),
     )
-    fields = ("sample", "temperature", "shield", "comm_range", "comm_weights")
+    fields = ("actions", "temperature", "shield", "comm_range", "comm_weights")
     settings: list[dict[str, Any]] = [dict(zip(fields, each, strict=True)) for each in choices]
     executions = [Execution(**each) for each in settings]
-    assert len({each.name for each in executions if each.sample}) == 3 * 2 * 3 * 9
+    assert len({each.name for each in executions if each.actions != "argmax"}) == 3 * 2 * 3 * 9
     assert Execution().name == "argmax"
-    assert Execution(sample=True, temperature=0.5, shield="pibt").name == "sampled,0.5,pibt"
+    assert Execution(actions="sampled", temperature=0.5, shield="pibt").name == "sampled,0.5,pibt"
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_different_variants_have_different_names():
             "'greedily'.*argmax, sampled, stuck, fallback, idle, pibt, pibt_swap, fixed, connected, binary, distance",
         ),
         ("", "unknown word ''"),
-        ("sampled,stuck", "sample twice"),
+        ("sampled,stuck", "actions twice"),
         ("sampled,1,2", "temperature twice"),
         ("pibt,idle", "shield twice"),
         ("pibt,pibt_swap", "shield twice"),
@@ -78,7 +78,7 @@ def test_names_that_say_nothing_clear_are_refused(text, message):
         Execution.parse(text)
 
 
-@pytest.mark.parametrize("field", ["sample", "shield", "comm_range", "comm_weights"])
+@pytest.mark.parametrize("field", ["actions", "shield", "comm_range", "comm_weights"])
 def test_unknown_values_are_refused_by_name(field):
     with pytest.raises(ValueError, match=f"{field} must be one of"):
         Execution(**{field: "often"})  # pyright: ignore[reportArgumentType]
@@ -89,7 +89,7 @@ def test_unknown_values_are_refused_by_name(field):
 def test_environments_of_an_execution_show_which_robots_are_stuck(instance: Instance, seed, steps):
     """Off its goal where it stood in one of its last steps: the last scalar, by the track of each robot."""
     height, width = instance.grid.shape
-    chosen = Execution(sample="stuck").env_settings(PolicyConfig(fov_radius=2, robot_features=("last_moves",)))
+    chosen = Execution(actions="stuck").env_settings(PolicyConfig(fov_radius=2, robot_features=("last_moves",)))
     env = BatchedEnv(1, num_agents=instance.num_agents, height=height, width=width, density=0.0, **chosen)
     env.reset(seed, instances=[instance])
     generator, track, goals = np.random.default_rng(seed), [], instance.goals.tolist()
@@ -106,13 +106,13 @@ def test_environments_of_an_execution_show_which_robots_are_stuck(instance: Inst
 
 @pytest.mark.parametrize("own", [(), ("stuck",), ("greedy_moves", "on_goal"), ("stuck", "greedy_moves", "jammed")])
 def test_a_fallback_is_told_the_greedy_moves_and_who_is_stuck_or_jammed(own):
-    known = Execution(sample="fallback").senses(PolicyConfig(robot_features=own)).robot_features
+    known = Execution(actions="fallback").senses(PolicyConfig(robot_features=own)).robot_features
     assert known[: len(own)] == own
     assert sorted(known) == sorted({*own, "greedy_moves", "stuck", "jammed"})
 
 
 def test_a_fallback_prefers_shorter_ways_then_staying_then_the_draw():
-    fallback, rng = Execution(sample="fallback", temperature=0.5), np.random.default_rng(0)
+    fallback, rng = Execution(actions="fallback", temperature=0.5), np.random.default_rng(0)
     logits = rng.normal(0, 100, (400, 5)).astype(np.float32)
     alarm, greedy, jammed = rng.random(400) < 0.5, rng.random((400, 5)) < 0.4, np.zeros(400, bool)
     noise = gumbel(np.arange(400, dtype=np.uint64), np.zeros(400, int))
@@ -137,7 +137,7 @@ def test_a_jammed_robot_draws_among_all_moves_and_shorter_ways_are_likelier():
     greedy[:, 3] = True
     noise = gumbel(np.arange(count, dtype=np.uint64), np.zeros(count, int))
     everyone = np.ones(count, bool)
-    scores = Execution(sample="fallback").scores(logits, everyone, lambda drawn: noise[drawn], greedy, everyone)
+    scores = Execution(actions="fallback").scores(logits, everyone, lambda drawn: noise[drawn], greedy, everyone)
     weights = np.array([0.3, 0.3, 0.2, 0.1 * np.exp(4), 0.1 * np.exp(2)])
     shares = np.bincount(scores.argmax(1), minlength=5) / count
     np.testing.assert_allclose(shares, weights / weights.sum(), atol=0.015)
@@ -147,7 +147,7 @@ def test_an_environment_has_the_senses_of_the_policy_and_the_radio_and_shield_of
     policy = PolicyConfig(fov_radius=3, comm_weights="distance", robot_features=("on_goal",))
     own = Execution().senses(policy)
     assert own == Senses(fov_radius=3, comm_weights="distance", robot_features=("on_goal",))
-    other = Execution(sample="stuck", comm_range="connected", comm_weights="binary", shield="pibt")
+    other = Execution(actions="stuck", comm_range="connected", comm_weights="binary", shield="pibt")
     assert other.senses(policy) == Senses(
         fov_radius=3, comm_weights="binary", comm_range="connected", robot_features=("on_goal", "stuck")
     )
@@ -192,7 +192,7 @@ def test_scores_of_a_robot_that_draws_are_its_tempered_logits_and_standard_gumbe
     def noise(drawn):
         return gumbel(seeds[drawn], np.full(int(drawn.sum()), 3))
 
-    scores = Execution(sample="stuck", temperature=2.0).scores(many, seeds % 2 == 0, noise)
+    scores = Execution(actions="stuck", temperature=2.0).scores(many, seeds % 2 == 0, noise)
     assert np.array_equal(scores[1::2], many[1::2])
     added = scores[::2] - logits / 2
     assert added.mean() == pytest.approx(np.euler_gamma, abs=0.03)
@@ -205,8 +205,8 @@ def test_scores_of_a_robot_that_draws_are_its_tempered_logits_and_standard_gumbe
     np.testing.assert_allclose(shares, weights / weights.sum(), atol=0.03)
 
 
-@pytest.mark.parametrize("sample", [False, True, "stuck"])
-def test_every_robot_draws_or_no_robot_does_or_those_that_are_alarmed(sample):
+@pytest.mark.parametrize("actions", ["argmax", "sampled", "stuck"])
+def test_every_robot_draws_or_no_robot_does_or_those_that_are_alarmed(actions):
     logits, alarm = np.zeros((6, 5), np.float32), np.arange(6) % 3 == 0
     asked = []
 
@@ -214,10 +214,10 @@ def test_every_robot_draws_or_no_robot_does_or_those_that_are_alarmed(sample):
         asked.append(drawn)
         return np.ones((int(drawn.sum()), 5), np.float32)
 
-    scores = Execution(sample=sample).scores(logits, alarm, noise)
-    drawing = {False: np.zeros(6, bool), True: np.ones(6, bool), "stuck": alarm}[sample]
+    scores = Execution(actions=actions).scores(logits, alarm, noise)
+    drawing = {"argmax": np.zeros(6, bool), "sampled": np.ones(6, bool), "stuck": alarm}[actions]
     assert (scores == drawing[:, None]).all()
-    assert len(asked) == bool(sample)
+    assert len(asked) == (actions != "argmax")
     assert (logits == 0).all(), "the logits are not written to"
 
 
@@ -229,4 +229,4 @@ def test_numbers_that_are_not_finite_are_refused():
         with pytest.raises(ValueError, match="logits are not finite: its weights or what it observes are damaged"):
             Execution().scores(logits, alarm, noise)
     with pytest.raises(ValueError, match="the logits over a temperature of 1e-38 are not finite: give a higher one"):
-        Execution(sample=True, temperature=1e-38).scores(np.full((2, 5), 1e9, np.float32), alarm, noise)
+        Execution(actions="sampled", temperature=1e-38).scores(np.full((2, 5), 1e9, np.float32), alarm, noise)

@@ -34,7 +34,7 @@ SMALL = PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=3.0)
 
 
 def quiet(config):
-    return TrainingProgress(config.epochs, Console(quiet=True))
+    return TrainingProgress(config.rounds, Console(quiet=True))
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def damaged_file(policy, path, name, value):
     return path
 
 
-@pytest.mark.parametrize("settings", [{"lr": 1e20}, {"lr": 1e38}, {"weight_decay": 1e30}, {"lr": 1e12, "epochs": 2}])
+@pytest.mark.parametrize("settings", [{"lr": 1e20}, {"lr": 1e38}, {"weight_decay": 1e30}, {"lr": 1e12, "rounds": 2}])
 def test_training_that_diverges_stops_with_one_line_and_no_policy(tmp_path, capsys, settings):
     config = replace(CONFIG, validate_every=1, **settings)
     with pytest.raises(SystemExit) as end:
@@ -101,7 +101,7 @@ def test_the_last_sound_state_is_kept_and_a_damaged_one_is_not_resumed(tmp_path,
     again = Training(config, folder, quiet(config))
     assert len(again.history) == 1
     again.run()
-    assert len(again.history) == config.epochs
+    assert len(again.history) == config.rounds
 
     state = torch.load(folder / "state.pt", weights_only=True)
     match where:
@@ -203,7 +203,7 @@ def test_scores_of_an_actor_that_are_not_finite_are_not_played(value):
 def test_a_temperature_that_makes_logits_infinite_is_refused():
     cases = [random_instance(height=5, width=5, num_agents=3, seed=0)]
     with pytest.raises(ValueError, match="temperature of 1e-300"):
-        rollout(Network(1.0), cases, execution=Execution(sample=True, temperature=1e-300), max_steps=5)
+        rollout(Network(1.0), cases, execution=Execution(actions="sampled", temperature=1e-300), max_steps=5)
 
 
 def test_a_robot_refuses_views_and_messages_that_are_not_finite(policy):

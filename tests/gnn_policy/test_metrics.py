@@ -146,8 +146,8 @@ def test_which_cases_the_expert_solves_is_no_matter_of_time(monkeypatch):
 
 EXECUTIONS = [
     Execution(),
-    Execution(sample=True, temperature=2.0),
-    Execution(sample="stuck", shield="pibt", comm_range="connected", comm_weights="distance"),
+    Execution(actions="sampled", temperature=2.0),
+    Execution(actions="stuck", shield="pibt", comm_range="connected", comm_weights="distance"),
 ]
 
 

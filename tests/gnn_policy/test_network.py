@@ -250,7 +250,7 @@ def test_a_bag_is_read_where_it_is_without_waiting_for_its_values(kind, encoder)
 
 def test_a_policy_says_in_which_environment_it_acts():
     config = PolicyConfig(encoder="lean", fov_radius=3, comm_radius=2.5, robot_features=("on_goal",))
-    policy = DecentralizedPolicy(config, Execution(sample="stuck", shield="pibt", comm_range="connected"))
+    policy = DecentralizedPolicy(config, Execution(actions="stuck", shield="pibt", comm_range="connected"))
     assert policy.env_settings() == {
         "fov_radius": 3,
         "extra_channels": (),

@@ -27,7 +27,7 @@ def home(tmp_path, monkeypatch):
     save_scen("elsewhere/far.scen", instance, "own.map")
     torch.manual_seed(0)
     config = PolicyConfig(encoder="lean", features=8, fov_radius=2, comm_radius=3.0)
-    save(DecentralizedPolicy(config, Execution(sample="stuck")), "policy.safetensors")
+    save(DecentralizedPolicy(config, Execution(actions="stuck")), "policy.safetensors")
     return tmp_path
 
 
@@ -87,7 +87,12 @@ def test_every_option_reaches_the_rollout(home, monkeypatch):
         oracles.distances(instance.grid, goal)[start]
         for start, goal in zip(oracles.cells(instance.starts), oracles.cells(instance.goals), strict=True)
     )
-    rows = [Execution(sample="stuck"), Execution(), Execution(sample=True, temperature=0.5, shield="pibt"), Execution()]
+    rows = [
+        Execution(actions="stuck"),
+        Execution(),
+        Execution(actions="sampled", temperature=0.5, shield="pibt"),
+        Execution(),
+    ]
     limits, tasks = [4 * longest, 4 * longest, 7, 9], ["one_shot"] * 3 + ["lifelong"]
     assert asked == [
         {"task": task, "seed": 3, "max_steps": [limit], "execution": row}
@@ -104,7 +109,7 @@ def test_a_policy_plays_as_its_file_says(home, monkeypatch):
     )
     for policy in ("n12-informed", "n12"):
         play.main(["own.scen", "--policy", policy, "--threads", "1"])
-    assert asked == [Execution(sample="stuck", shield="pibt"), Execution(sample="stuck")]
+    assert asked == [Execution(actions="stuck", shield="pibt"), Execution(actions="stuck")]
     play.main(["own.scen", "--policy", "n12-informed", "--execution", "argmax", "--threads", "1"])
     assert asked[-1] == Execution(shield="pibt"), "an execution keeps the shield of the file unless it names one"
 

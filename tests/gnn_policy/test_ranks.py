@@ -40,7 +40,7 @@ class Progress(TrainingProgress):
             os.kill(os.getpid(), signal.SIGKILL)
 
 with join_ranks() as ranks:
-    run = training.Training(config, folder, Progress(config.epochs, Console(quiet=True)), ranks)
+    run = training.Training(config, folder, Progress(config.rounds, Console(quiet=True)), ranks)
     run.run()
 tasks = Path("/proc/self/task")
 threads = sorted(each.joinpath("comm").read_text() for each in tasks.iterdir()) if tasks.exists() else []
@@ -77,7 +77,7 @@ def whole(tmp_path_factory):
 
 
 def test_both_processes_hold_the_same_policy_and_data_after_every_round(whole):
-    for number in range(CONFIG.epochs):
+    for number in range(CONFIG.rounds):
         assert_equal(report(whole, "whole", 0, number), report(whole, "whole", 1, number))
     assert not torch.equal(report(whole, "whole", 0, 0)["head.weight"], report(whole, "whole", 0, 2)["head.weight"])
 
@@ -101,7 +101,7 @@ def test_a_round_has_as_many_states_as_that_of_one_process_and_its_halves_differ
 def test_the_state_and_the_best_policy_are_those_of_the_team(whole):
     state = torch.load(whole / "whole" / "state.pt", weights_only=True)
     assert state["processes"] == 2
-    last = report(whole, "whole", 1, CONFIG.epochs - 1)
+    last = report(whole, "whole", 1, CONFIG.rounds - 1)
     assert all(torch.equal(tensor, last[name]) for name, tensor in state["policy"].items())
     assert state["history"][-1]["samples"] == 3 * 3 * CONFIG.batch_size * CONFIG.num_agents
 

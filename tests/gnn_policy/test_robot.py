@@ -129,11 +129,11 @@ def test_attention_takes_its_softmax_over_the_messages_that_came(seed, count, lo
 
 
 @pytest.mark.parametrize("weights", ["binary", "distance"])
-@pytest.mark.parametrize("sample", [False, True, "stuck", "fallback"])
+@pytest.mark.parametrize("actions", ["argmax", "sampled", "stuck", "fallback"])
 @pytest.mark.parametrize(("taps", "graph_layer"), [(1, "filter"), (3, "filter"), (3, "attention")])
-def test_a_team_of_robots_walks_the_paths_of_rollout(taps, graph_layer, sample, weights):
+def test_a_team_of_robots_walks_the_paths_of_rollout(taps, graph_layer, actions, weights):
     """Views from the PettingZoo environment, actions to a slow world that shares only the shield."""
-    execution = Execution(sample=sample, temperature=0.7)
+    execution = Execution(actions=actions, temperature=0.7)
     config = {"taps": taps, "graph_layer": graph_layer, "comm_radius": 3.0, "comm_weights": weights, **RICH}
     policy = seeded_policy(1, execution, **config)
     cases = make_cases(
@@ -223,7 +223,7 @@ def test_a_lost_message_adds_nothing():
 
 
 def test_the_news_that_a_robot_is_stuck_comes_with_its_message():
-    policy = seeded_policy(taps=2, execution=Execution(sample="stuck", temperature=1e6))
+    policy = seeded_policy(taps=2, execution=Execution(actions="stuck", temperature=1e6))
     view = np.random.default_rng(0).random((3, 7, 7), dtype=np.float32)
     for stuck, came in ((True, True), (True, False), (False, True)):
         moves = set()
@@ -237,7 +237,7 @@ def test_the_news_that_a_robot_is_stuck_comes_with_its_message():
 
 @pytest.mark.parametrize("own", [False, True])
 def test_a_robot_that_is_reset_begins_another_case(own):
-    stuck = Execution(sample="stuck")
+    stuck = Execution(actions="stuck")
     policy = seeded_policy(taps=1, execution=stuck if own else Execution())
     view, cell = np.zeros((3, 7, 7), np.float32), np.array([2, 3])
     robot = Robot(policy, seed=4) if own else Robot(policy, stuck, seed=4)

@@ -31,7 +31,7 @@ RICH = replace(
     robot_features=("last_moves", "steps_left", "greedy_moves"),
     edge_features=("relative_position", "goal_direction"),
 )
-SAMPLES = [False, True, "stuck"]
+CHOICES = ["argmax", "sampled", "stuck"]
 
 
 def random_cases(seed=0, maps=6, num_agents=4, height=6, width=7, density=0.15, cases_per_map=2):
@@ -171,7 +171,7 @@ class Plain(torch.nn.Module):
 
 
 @pytest.mark.parametrize(
-    "execution", [Execution(), Execution(sample="stuck"), Execution(shield="pibt", comm_range="connected")]
+    "execution", [Execution(), Execution(actions="stuck"), Execution(shield="pibt", comm_range="connected")]
 )
 def test_a_network_of_your_own_is_executed_like_a_policy(mixed, policy, execution):
     network = Plain(policy).train()
@@ -194,7 +194,7 @@ def test_what_is_neither_network_nor_actor_is_refused(cases):
 
 
 @pytest.mark.parametrize(
-    "own", [Execution(sample="stuck"), Execution(shield="pibt", sample=True), Execution(comm_range="connected")]
+    "own", [Execution(actions="stuck"), Execution(shield="pibt", actions="sampled"), Execution(comm_range="connected")]
 )
 def test_a_policy_is_executed_in_its_own_way_unless_told_otherwise(cases, own):
     policy = seeded_policy(execution=own)
@@ -206,9 +206,9 @@ def test_a_policy_is_executed_in_its_own_way_unless_told_otherwise(cases, own):
     assert not all(same(by_itself, plain, i, i) for i in range(len(cases)))
 
 
-@pytest.mark.parametrize("sample", SAMPLES)
-def test_the_policy_is_judged_like_any_actor(cases, policy, sample):
-    played = rollout(policy, cases, execution=Execution(sample=sample), max_steps=30, seed=2)
+@pytest.mark.parametrize("actions", CHOICES)
+def test_the_policy_is_judged_like_any_actor(cases, policy, actions):
+    played = rollout(policy, cases, execution=Execution(actions=actions), max_steps=30, seed=2)
     assert_judged_rightly(played, [30] * len(cases))
     assert 0 < played.replaced.mean() < 1
 
@@ -224,11 +224,11 @@ def same(one, two, i, j):
 
 WAYS = [
     ("one_shot", Execution(), 0.0),
-    ("one_shot", Execution(sample="stuck", shield="pibt", comm_range="connected"), 0.3),
-    ("lifelong", Execution(sample=True, comm_weights="distance"), 0.5),
+    ("one_shot", Execution(actions="stuck", shield="pibt", comm_range="connected"), 0.3),
+    ("lifelong", Execution(actions="sampled", comm_weights="distance"), 0.5),
     ("lifelong", Execution(shield="pibt"), 0.0),
     ("one_shot", Execution(shield="pibt_swap"), 0.0),
-    ("lifelong", Execution(sample="stuck", shield="pibt_swap"), 0.2),
+    ("lifelong", Execution(actions="stuck", shield="pibt_swap"), 0.2),
 ]
 
 
@@ -251,10 +251,10 @@ def test_teams_and_maps_of_any_sizes_play_together_as_each_alone(mixed, config, 
         assert_judged_rightly(together, limits)
 
 
-@pytest.mark.parametrize("sample", SAMPLES)
-def test_the_size_of_batches_does_not_matter(cases, policy, sample):
+@pytest.mark.parametrize("actions", CHOICES)
+def test_the_size_of_batches_does_not_matter(cases, policy, actions):
     played = [
-        rollout(policy, cases, execution=Execution(sample=sample), max_steps=25, batch_size=size)
+        rollout(policy, cases, execution=Execution(actions=actions), max_steps=25, batch_size=size)
         for size in (1, 3, 5, 256)
     ]
     for other in played[1:]:
@@ -285,14 +285,14 @@ def test_neither_does_the_memory_that_teams_may_take(mixed, policy, monkeypatch)
     seed=st.integers(0, 2**64 - 1),
     order=st.permutations(range(12)),
     kept=st.integers(1, 12),
-    sample=st.sampled_from(SAMPLES),
+    actions=st.sampled_from(CHOICES),
     shield=st.sampled_from(["idle", "pibt", "pibt_swap"]),
     comm_range=st.sampled_from(["fixed", "connected"]),
 )
 def test_a_case_depends_neither_on_its_place_nor_on_the_others(
-    cases, policy, seed, order, kept, sample, shield, comm_range
+    cases, policy, seed, order, kept, actions, shield, comm_range
 ):
-    settings = {"execution": Execution(sample=sample, shield=shield, comm_range=comm_range), "max_steps": 12}
+    settings = {"execution": Execution(actions=actions, shield=shield, comm_range=comm_range), "max_steps": 12}
     whole = rollout(policy, cases, seed=seed, **settings)
     chosen = order[:kept]
     part = rollout(policy, [cases[i] for i in chosen], seed=seed, batch_size=5, **settings)
@@ -300,7 +300,7 @@ def test_a_case_depends_neither_on_its_place_nor_on_the_others(
 
 
 def test_equal_cases_end_equally_unless_their_seeds_differ(cases, policy):
-    copies, settings = [cases[0]] * 6, {"execution": Execution(sample=True), "max_steps": 25}
+    copies, settings = [cases[0]] * 6, {"execution": Execution(actions="sampled"), "max_steps": 25}
     equal = rollout(policy, copies, seed=3, **settings)
     assert all(same(equal, equal, 0, i) for i in range(6))
     seeds = [3, 4, 5, 3, 4, 5]
@@ -373,7 +373,7 @@ def test_neither_batches_nor_neighbours_that_end_early_change_how_ties_are_broke
 
 def test_equal_seeds_repeat_and_others_do_not(cases, policy):
     one, two, three = (
-        rollout(policy, cases, execution=Execution(sample=True), seed=seed, max_steps=25) for seed in (5, 5, 6)
+        rollout(policy, cases, execution=Execution(actions="sampled"), seed=seed, max_steps=25) for seed in (5, 5, 6)
     )
     assert all(same(one, two, i, i) for i in range(len(cases)))
     assert not all(same(one, three, i, i) for i in range(len(cases)))
@@ -386,7 +386,7 @@ def test_sampled_moves_follow_the_tempered_softmax_and_argmax_its_mode(cases, po
     env = BatchedEnv(3000, num_agents=4, height=6, width=7, **policy.env_settings())
     env.reset(0, instances=[case] * 3000, observe=False)
     for temperature in (0.3, 1.0, 4.0):
-        moves = PolicyActor(policy, Execution(sample=True, temperature=temperature)).act(env)
+        moves = PolicyActor(policy, Execution(actions="sampled", temperature=temperature)).act(env)
         counted = np.stack([(moves == action).mean(axis=0) for action in range(5)], -1)
         np.testing.assert_allclose(counted, torch.softmax(logits / temperature, -1).numpy(), atol=0.04)
     moves = PolicyActor(policy, Execution()).act(env)
@@ -396,21 +396,21 @@ def test_sampled_moves_follow_the_tempered_softmax_and_argmax_its_mode(cases, po
 @pytest.mark.parametrize("taps", [1, 3])
 def test_sampling_when_stuck_differs_from_argmax_only_for_robots_that_know_of_a_stuck_one(cases, taps):
     policy = seeded_policy(replace(CONFIG, comm_radius=2.5, taps=taps))
-    actors = {sample: PolicyActor(policy, Execution(sample=sample, shield="pibt")) for sample in SAMPLES}
+    actors = {actions: PolicyActor(policy, Execution(actions=actions, shield="pibt")) for actions in CHOICES}
     env = BatchedEnv(len(cases), num_agents=4, height=6, width=7, **actors["stuck"].env_settings(), max_cycles=99)
     env.reset(1, instances=cases)
     generator, tracks = np.random.default_rng(0), [env.positions.tolist()]
     drew = stayed = told = 0
     for _ in range(12):
-        scores = {sample: actor.act(env) for sample, actor in actors.items()}
+        scores = {actions: actor.act(env) for actions, actor in actors.items()}
         for b, case in enumerate(cases):
             here, before = tracks[-1][b], [track[b] for track in tracks[:-1]]
             stuck = [here[i] in [then[i] for then in before] and here[i] != case.goals[i].tolist() for i in range(4)]
             hears = oracles.communication_graph(here, 2.5)
             draws = [stuck[i] or (taps > 1 and any(stuck[j] for j in range(4) if hears[i, j])) for i in range(4)]
             for i, draw in enumerate(draws):
-                assert np.array_equal(scores["stuck"][b, i], scores[draw][b, i])
-                assert not np.array_equal(scores[True][b, i], scores[False][b, i])
+                assert np.array_equal(scores["stuck"][b, i], scores["sampled" if draw else "argmax"][b, i])
+                assert not np.array_equal(scores["sampled"][b, i], scores["argmax"][b, i])
             drew, stayed = drew + sum(draws), stayed + draws.count(False)
             told += sum(draws) - sum(stuck)
         env.step(generator.integers(5, size=(len(cases), 4)), observe=False)
@@ -609,10 +609,10 @@ def test_actions_that_are_no_numbers_are_refused(cases):
         rollout(Broken(), cases)
 
 
-@pytest.mark.parametrize("sample", SAMPLES)
+@pytest.mark.parametrize("actions", CHOICES)
 @pytest.mark.parametrize("shield", ["pibt", "pibt_swap"])
-def test_under_the_pibt_shields_nothing_collides_and_batches_do_not_matter(cases, policy, shield, sample):
-    settings = {"execution": Execution(shield=shield, sample=sample), "max_steps": 25, "seed": 3}
+def test_under_the_pibt_shields_nothing_collides_and_batches_do_not_matter(cases, policy, shield, actions):
+    settings = {"execution": Execution(shield=shield, actions=actions), "max_steps": 25, "seed": 3}
     out = rollout(policy, cases, **settings)
     again = rollout(policy, cases, **settings, batch_size=5)
     for i, instance in enumerate(cases):

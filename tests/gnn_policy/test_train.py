@@ -68,17 +68,17 @@ def test_a_file_of_settings_is_the_base_of_the_other_options_and_names_the_run(t
     command = train.parse(["--config", str(tmp_path / "mixed.toml"), "--lr", "0.5", "--policy.taps", "2"])
     assert command.config == replace(MIXED, lr=0.5, policy=replace(MIXED.policy, taps=2))
     assert train.parse([f"--config={tmp_path / 'mixed.toml'}"]).config == MIXED
-    (tmp_path / "two.toml").write_text("epochs = 2\n")
-    assert train.parse(["--config", str(tmp_path / "two.toml")]).config == TrainConfig(epochs=2)
+    (tmp_path / "two.toml").write_text("rounds = 2\n")
+    assert train.parse(["--config", str(tmp_path / "two.toml")]).config == TrainConfig(rounds=2)
 
 
 @pytest.mark.parametrize(
     ("content", "words"),
     [
         (None, "none.toml"),
-        ("epoch = 2", "there is no setting 'epoch': the settings are aggregation"),
-        ("epochs = 0", "epochs must be positive"),
-        ("epochs =", "bad.toml"),
+        ("round = 2", "there is no setting 'round': the settings are aggregation"),
+        ("rounds = 0", "rounds must be positive"),
+        ("rounds =", "bad.toml"),
     ],
 )
 def test_a_file_of_settings_that_is_wrong_takes_one_line(tmp_path, capsys, content, words):
@@ -125,7 +125,7 @@ def test_a_run_on_the_users_own_map_shows_one_table(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
-        ("--epochs 0", "epochs"),
+        ("--rounds 0", "rounds"),
         ("--density 0.99", "density|obstacles|room"),
         ("--num-agents 500", "agents"),
         ("--policy.encoder released --policy.fov-radius 2", "fov_radius"),
@@ -158,7 +158,7 @@ def test_a_folder_that_is_taken_is_refused_in_one_line(tmp_path, capsys):
     )
 
 
-@pytest.mark.parametrize("wrong", [["--surprise"], ["--epochs", "many"], ["--recipe", "cake"], ["--policy.taps", "0"]])
+@pytest.mark.parametrize("wrong", [["--surprise"], ["--rounds", "many"], ["--recipe", "cake"], ["--policy.taps", "0"]])
 def test_unknown_options_and_values_are_refused(capsys, wrong):
     with pytest.raises(SystemExit) as end:
         train.main(wrong)
@@ -197,7 +197,7 @@ def test_a_teacher_whose_plans_are_wrong_stops_training_with_its_name_and_fault(
     monkeypatch.setitem(sys.modules, "lazy", module)
     for name in ("stay", "leave", "guess"):
         with pytest.raises(SystemExit) as end:
-            train.main(arguments_for(replace(CONFIG, teacher=f"lazy:{name}"), tmp_path / name))
+            train.main(arguments_for(replace(CONFIG, expert=f"lazy:{name}"), tmp_path / name))
         assert end.value.code == 2
         told = capsys.readouterr().err
         assert told.startswith("error: ")

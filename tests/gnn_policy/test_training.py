@@ -32,7 +32,7 @@ class Silence(TrainingProgress):
     """Progress that nobody watches; whoever listens hears of finished rounds."""
 
     def __init__(self, listener=lambda row: None):
-        super().__init__(CONFIG.epochs, Console(quiet=True))
+        super().__init__(CONFIG.rounds, Console(quiet=True))
         self.listener = listener
 
     def finished(self, row):
@@ -84,7 +84,7 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
     again = trained(CONFIG, tmp_path / "again")
     assert_equal_weights(weights(run), weights(again))
     assert metrics(run.folder) == metrics(again.folder)
-    other = trained(replace(CONFIG, seed=1, epochs=1), tmp_path / "other")
+    other = trained(replace(CONFIG, seed=1, rounds=1), tmp_path / "other")
     assert not torch.equal(weights(run)["head.weight"], weights(other)["head.weight"])
 
 
@@ -92,11 +92,15 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
     "settings",
     [
         {},
-        {"teacher": "pibt", "robot_order": "random", "beta_decay": 0.5},
-        {"aggregation": "stuck", "teacher": "experts:lacam"},
+        {"expert": "pibt", "robot_order": "random", "beta_decay": 0.5},
+        {"aggregation": "stuck", "expert": "experts:lacam"},
         {"policy": replace(CONFIG.policy, graph_layer="own_layers:Forgetful")},
         {"families": MIXED.families, "augment": True, "beta_decay": 0.5},
-        {"families": MIXED.families, "sample_rollouts": "stuck", "execution": Execution(sample="stuck", shield="pibt")},
+        {
+            "families": MIXED.families,
+            "rollout_actions": "stuck",
+            "execution": Execution(actions="stuck", shield="pibt"),
+        },
     ],
 )
 def test_a_run_stopped_after_any_round_goes_on_to_the_same_end(run, tmp_path, settings):
@@ -112,7 +116,7 @@ def test_a_run_stopped_after_any_round_goes_on_to_the_same_end(run, tmp_path, se
         raise StopError
 
     folder = tmp_path / "run"
-    for _ in range(CONFIG.epochs):
+    for _ in range(CONFIG.rounds):
         with pytest.raises(StopError):
             trained(config, folder, stop)
     resumed = trained(config, folder)
@@ -174,11 +178,11 @@ def test_seconds_are_those_of_the_clock(tmp_path, monkeypatch):
 
 
 def test_the_learning_rate_falls_along_a_cosine(run, tmp_path):
-    config = replace(CONFIG, epochs=5, lr=1e-2, final_lr=1e-4, validate_every=9, updates_per_epoch=1, dagger_every=0)
+    config = replace(CONFIG, rounds=5, lr=1e-2, final_lr=1e-4, validate_every=9, updates_per_round=1, dagger_every=0)
     for finished in (run, trained(config, tmp_path / "run")):
         c = finished.config
         for row in finished.history:
-            expected = c.final_lr + (c.lr - c.final_lr) * (1 + math.cos(math.pi * row.round / c.epochs)) / 2
+            expected = c.final_lr + (c.lr - c.final_lr) * (1 + math.cos(math.pi * row.round / c.rounds)) / 2
             assert row.lr == pytest.approx(expected, rel=1e-9)
 
 
@@ -226,7 +230,7 @@ def test_the_best_validated_round_is_kept(tmp_path, monkeypatch, merits, best):
     snapshots = []
     folder = tmp_path / "run"
     run = Training(
-        replace(CONFIG, validate_every=1, updates_per_epoch=1),
+        replace(CONFIG, validate_every=1, updates_per_round=1),
         folder,
         Silence(lambda row: snapshots.append(weights(run))),
     )
@@ -272,7 +276,7 @@ def test_one_batch_holds_teams_and_maps_of_several_sizes(tmp_path, monkeypatch):
 
 
 def test_training_starts_from_the_weights_that_init_names(run, tmp_path):
-    config = replace(CONFIG, init=str(run.folder), seed=9, lr=1e-12, final_lr=1e-12, epochs=1)
+    config = replace(CONFIG, init=str(run.folder), seed=9, lr=1e-12, final_lr=1e-12, rounds=1)
     begun = Training(config, tmp_path / "run", Silence())
     assert_equal_weights(weights(begun), load(run.folder).state_dict())
     begun.run()
@@ -316,22 +320,22 @@ def test_init_of_another_network_is_refused_and_the_differences_are_named(run, t
 
 
 def test_the_policy_of_a_run_is_saved_with_the_execution_of_the_settings(tmp_path):
-    execution = Execution(sample=True, temperature=0.5, shield="pibt", comm_range="connected")
-    run = trained(replace(CONFIG, execution=execution, epochs=2), tmp_path)
+    execution = Execution(actions="sampled", temperature=0.5, shield="pibt", comm_range="connected")
+    run = trained(replace(CONFIG, execution=execution, rounds=2), tmp_path)
     assert run.policy.execution == load(tmp_path).execution == checkpoint.executed_as(tmp_path) == execution
 
 
 def test_validation_plays_under_the_shield_and_radio_of_the_execution(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(training, "rollout", lambda *given, **how: asked.append(how) or rollout(*given, **how))
-    execution = Execution(sample="stuck", shield="pibt", comm_range="connected")
-    trained(replace(CONFIG, execution=execution, epochs=2), tmp_path / "one")
-    trained(replace(CONFIG, execution=execution, sample_rollouts="stuck", epochs=2), tmp_path / "two")
-    assert [each["execution"] for each in asked] == [replace(execution, sample=False), execution]
+    execution = Execution(actions="stuck", shield="pibt", comm_range="connected")
+    trained(replace(CONFIG, execution=execution, rounds=2), tmp_path / "one")
+    trained(replace(CONFIG, execution=execution, rollout_actions="stuck", rounds=2), tmp_path / "two")
+    assert [each["execution"] for each in asked] == [replace(execution, actions="argmax"), execution]
 
 
 def test_without_a_number_of_updates_a_round_is_one_pass(tmp_path, monkeypatch):
-    config = replace(CONFIG, updates_per_epoch=None, epochs=2)
+    config = replace(CONFIG, updates_per_round=None, rounds=2)
     run, seen = batches_seen(monkeypatch, config, tmp_path / "run")
     assert len(seen) == sum(math.ceil(row.demonstrations / 8) for row in run.history)
     for row in run.history:
@@ -342,7 +346,7 @@ def test_without_a_number_of_updates_a_round_is_one_pass(tmp_path, monkeypatch):
 
 
 def test_a_share_of_each_batch_is_fresh_once_states_are_aggregated(tmp_path, monkeypatch):
-    config = replace(CONFIG, updates_per_epoch=40, epochs=2, fresh_share=0.25, fresh_window=5)
+    config = replace(CONFIG, updates_per_round=40, rounds=2, fresh_share=0.25, fresh_window=5)
     run, seen = batches_seen(monkeypatch, config, tmp_path / "run")
     first, second = run.history[0].demonstrations, run.history[1].demonstrations
     imitating = np.concatenate([chosen for count, chosen in seen if count == first])
@@ -418,7 +422,7 @@ def test_settings_that_do_not_fit_leave_no_folder_behind(tmp_path):
         replace(CONFIG, density=0.99),
         replace(CONFIG, num_agents=40),
         replace(CONFIG, device="abacus"),
-        replace(CONFIG, teacher="nobody"),
+        replace(CONFIG, expert="nobody"),
         replace(CONFIG, backend="process", collectors=3, rollout_teams=16),
         replace(CONFIG, policy=PolicyConfig(encoder="released", fov_radius=2)),
         replace(CONFIG, families=(*MIXED.families, replace(MIXED.families[0], num_agents=(100, 120)))),

@@ -12,7 +12,7 @@ import pytest
 import experts
 import oracles
 from gnn_policy.cases import Cases, Family, make_cases
-from gnn_policy.teacher import Teacher
+from gnn_policy.labelling import Labeller
 from mapf_env import BatchedEnv, Instance, Senses, States
 
 STEPS = [(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)]
@@ -35,8 +35,8 @@ def crowded():
     return make_cases("train", seed=5, maps=4, cases_per_map=25, families=[family])
 
 
-def taught_by(cases, **settings):
-    return Teacher(cases.grids, **{"w": 1.05, "node_limit": 2000, "threads": 1, **settings})
+def labeller_for(cases, **settings):
+    return Labeller(cases.grids, **{"w": 1.05, "node_limit": 2000, "threads": 1, **settings})
 
 
 def states_of(cases, chosen, positions=None):
@@ -76,14 +76,14 @@ SOLVERS = {
 @pytest.mark.parametrize("threads", [1, 3])
 def test_any_solver_can_teach_the_first_move_of_its_plan(cases, name, threads):
     """States of different sizes in one call, each with the answer that it gets alone."""
-    teacher = taught_by(cases, solver=name, threads=threads)
+    labeller = labeller_for(cases, solver=name, threads=threads)
     order = np.tile(np.arange(len(cases)), 2)
     halfway = [plan_paths(each) for each in cases.instances]
     positions = [each.starts for each in cases.instances]
     positions += [*(paths[len(paths) // 2] for paths in halfway[:-1]), cases.instances[-1].goals]
     states = states_of(cases, order, positions)
     assert len(set(np.diff(states.offsets).tolist())) > 3
-    moves, solved = teacher.moves(states)
+    moves, solved = labeller.moves(states)
     assert moves.shape == (states.num_robots,)
     expected = [SOLVERS[name](cases.instances[i].at(here)) for i, here in zip(order, positions, strict=True)]
     assert solved.tolist() == [result.solved for result in expected]
@@ -92,7 +92,7 @@ def test_any_solver_can_teach_the_first_move_of_its_plan(cases, name, threads):
         count = len(positions[t])
         assert of_team(moves, states, t).tolist() == (first_moves(result, count) if result.solved else [4] * count)
     assert set(of_team(moves, states, len(order) - 1).tolist()) == {4}
-    by_ecbs, _ = taught_by(cases).moves(states)
+    by_ecbs, _ = labeller_for(cases).moves(states)
     assert (moves != by_ecbs).any() == (name != "ecbs"), "the cases do not tell this solver from ECBS"
 
 
@@ -100,7 +100,7 @@ def test_goals_are_those_of_the_state(cases):
     """In a lifelong task robots have other goals than at the start."""
     states = states_of(cases, np.arange(len(cases)))
     swapped = replace(states, positions=states.goals.copy(), goals=states.positions.copy())
-    moves, solved = taught_by(cases).moves(swapped)
+    moves, solved = labeller_for(cases).moves(swapped)
     assert solved.all()
     for t, case in enumerate(cases.instances):
         back = Instance(case.grid, case.goals, case.starts)
@@ -112,22 +112,22 @@ def test_a_solver_that_finds_nothing_teaches_nothing():
     cases = Cases([corridor], [corridor.grid], np.zeros(1, np.int32), np.zeros(1, np.int32))
     positions = [corridor.starts, corridor.goals, corridor.starts]
     for name in ("pibt", "prioritised", "lacam", "ecbs"):
-        teacher = taught_by(cases, solver=name, node_limit=50)
-        found, unsolved = teacher.label(states_of(cases, [0] * 3, positions))
+        labeller = labeller_for(cases, solver=name, node_limit=50)
+        found, unsolved = labeller.label(states_of(cases, [0] * 3, positions))
         assert (found.states.positions.tolist(), unsolved) == (corridor.goals.tolist(), 2)
         assert found.actions.tolist() == [4, 4]
-        found, unsolved = teacher.demonstrate(states_of(cases, [0] * 2))
+        found, unsolved = labeller.demonstrate(states_of(cases, [0] * 2))
         assert (len(found), found.states.num_robots, len(found.actions), unsolved) == (0, 0, 0, 2)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("robot_order", ["index", "random", "nearest"])
 def test_no_states_have_no_labels(cases, name, robot_order):
-    teacher = taught_by(cases, solver=name, robot_order=robot_order)
+    labeller = labeller_for(cases, solver=name, robot_order=robot_order)
     none = states_of(cases, [0, 1]).take(np.empty(0, np.intp))
-    moves, solved = teacher.moves(none)
-    assert (len(moves), len(solved), teacher.plans(none)) == (0, 0, [])
-    for ask in (teacher.label, teacher.demonstrate):
+    moves, solved = labeller.moves(none)
+    assert (len(moves), len(solved), labeller.plans(none)) == (0, 0, [])
+    for ask in (labeller.label, labeller.demonstrate):
         found, unsolved = ask(none)
         assert (len(found), len(found.actions), unsolved) == (0, 0, 0)
 
@@ -136,10 +136,10 @@ def test_a_solver_that_answers_another_question_is_found_out(cases, monkeypatch)
     module = ModuleType("their_solvers")
     module.stubborn = lambda instance: experts.solve(cases.instances[0])  # pyright: ignore[reportAttributeAccessIssue]
     monkeypatch.setitem(sys.modules, "their_solvers", module)
-    teacher = taught_by(cases, solver="their_solvers:stubborn")
-    assert teacher.moves(states_of(cases, [0]))[1].all()
+    labeller = labeller_for(cases, solver="their_solvers:stubborn")
+    assert labeller.moves(states_of(cases, [0]))[1].all()
     with pytest.raises(ValueError, match=r"do not solve the instance: "):
-        teacher.moves(states_of(cases, [0, 1]))
+        labeller.moves(states_of(cases, [0, 1]))
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_a_solver_that_answers_another_question_is_found_out(cases, monkeypatch)
 )
 def test_a_teacher_that_cannot_teach_is_refused(cases, settings, message):
     with pytest.raises(ValueError, match=message):
-        taught_by(cases, **settings)
+        labeller_for(cases, **settings)
 
 
 def label_in_order(case, order, **limits):
@@ -166,10 +166,10 @@ def label_in_order(case, order, **limits):
 @pytest.mark.parametrize(("robot_order", "sign"), [("index", 0), ("farthest", -1), ("nearest", 1)])
 def test_the_expert_meets_the_robots_in_the_order_asked_for(crowded, robot_order, sign):
     states = states_of(crowded, np.arange(len(crowded)))
-    teacher = taught_by(crowded, robot_order=robot_order, node_limit=500)
-    moves, solved = teacher.moves(states)
+    labeller = labeller_for(crowded, robot_order=robot_order, node_limit=500)
+    moves, solved = labeller.moves(states)
     assert solved.all()
-    plans = teacher.plans(states)
+    plans = labeller.plans(states)
     for t, (case, plan) in enumerate(zip(crowded.instances, plans, strict=True)):
         ways = [abs(r - y) + abs(c - x) for (r, c), (y, x) in zip(case.starts, case.goals, strict=True)]
         order = sorted(range(4), key=lambda robot: (sign * ways[robot], robot))
@@ -178,15 +178,15 @@ def test_the_expert_meets_the_robots_in_the_order_asked_for(crowded, robot_order
         assert plan
         assert not plan.violations(case)
         assert plan.actions[0].tolist() == taught
-    by_number, _ = taught_by(crowded, node_limit=500).moves(states)
+    by_number, _ = labeller_for(crowded, node_limit=500).moves(states)
     assert (moves != by_number).any() == (robot_order != "index"), "the cases do not tell the orders apart"
 
 
 def test_a_random_order_is_a_function_of_the_state(crowded):
     count = len(crowded)
-    teacher = taught_by(crowded, robot_order="random", node_limit=500)
-    moves, _ = teacher.moves(states_of(crowded, np.arange(count)))
-    threaded = taught_by(crowded, robot_order="random", node_limit=500, threads=2)
+    labeller = labeller_for(crowded, robot_order="random", node_limit=500)
+    moves, _ = labeller.moves(states_of(crowded, np.arange(count)))
+    threaded = labeller_for(crowded, robot_order="random", node_limit=500, threads=2)
     again, _ = threaded.moves(states_of(crowded, np.arange(count)[::-1]))
     assert np.array_equal(again.reshape(count, 4)[::-1], moves.reshape(count, 4))
     orders = [list(each) for each in permutations(range(4))]
@@ -201,23 +201,23 @@ def test_a_random_order_is_a_function_of_the_state(crowded):
 
 def test_the_teacher_reports_how_long_it_took(cases):
     times = iter(range(0, 1000, 5))
-    teacher = taught_by(cases, solver="pibt", clock=lambda: next(times))
+    labeller = labeller_for(cases, solver="pibt", clock=lambda: next(times))
     for asked in (1, 2, 3):
-        teacher.moves(states_of(cases, [0]))
-        assert teacher.seconds == 5 * asked
+        labeller.moves(states_of(cases, [0]))
+        assert labeller.seconds == 5 * asked
 
 
 def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
     family = Family(num_agents=(6, 6), height=(4, 4), width=(4, 4), density=(0.0, 0.0))
     crowd = make_cases("train", seed=1, maps=2, cases_per_map=4, families=[family])
-    teacher = taught_by(crowd, w=1.0, node_limit=3)
+    labeller = labeller_for(crowd, w=1.0, node_limit=3)
     solved = [experts.solve(each, w=1.0, node_limit=3).solved for each in crowd.instances]
     assert not all(solved), "the cases are too easy for this test"
     assert any(solved), "the cases are too hard for this test"
-    found, unsolved = teacher.label(states_of(crowd, np.arange(8)))
+    found, unsolved = labeller.label(states_of(crowd, np.arange(8)))
     assert unsolved == solved.count(False)
     assert found.states.seeds.tolist() == [i for i in range(8) if solved[i]]
-    twice, counted = teacher.label(states_of(crowd, np.tile(np.arange(8), 2)))
+    twice, counted = labeller.label(states_of(crowd, np.tile(np.arange(8), 2)))
     assert (len(twice), counted) == (2 * len(found), 2 * unsolved)
 
 
@@ -225,11 +225,11 @@ def test_plans_without_a_proof_teach_nothing():
     crowd = make_cases("train", seed=1, maps=1, cases_per_map=2, families=[Family(num_agents=(40, 40))])
     results = [experts.solve(case, w=1.02, node_limit=10) for case in crowd.instances]
     assert any(result.solution is not None and not result.solved for result in results), "the cases do not test this"
-    teacher = taught_by(crowd, w=1.02, node_limit=10)
+    labeller = labeller_for(crowd, w=1.02, node_limit=10)
     states = states_of(crowd, np.arange(2))
     expected = [result.solved for result in results]
-    assert [plan is not None for plan in teacher.plans(states)] == expected
-    assert teacher.moves(states)[1].tolist() == expected
+    assert [plan is not None for plan in labeller.plans(states)] == expected
+    assert labeller.moves(states)[1].tolist() == expected
 
 
 def test_labels_keep_the_order_of_the_visits_and_each_state_its_history(cases):
@@ -237,7 +237,7 @@ def test_labels_keep_the_order_of_the_visits_and_each_state_its_history(cases):
     states = states_of(cases, order)
     history = np.random.default_rng(0).integers(-1, 5, states.moves.shape).astype(np.int8)
     states = replace(states, moves=history, times=np.arange(6, dtype=np.int32))
-    found, unsolved = taught_by(cases).label(states)
+    found, unsolved = labeller_for(cases).label(states)
     assert unsolved == 0
     for each in fields(States):
         assert np.array_equal(getattr(found.states, each.name), getattr(states, each.name)), each.name
@@ -252,7 +252,7 @@ def test_labels_keep_the_order_of_the_visits_and_each_state_its_history(cases):
 def test_demonstrated_states_are_those_of_an_environment_that_follows_the_plans(cases, name, steps):
     """Positions, histories, times and counters, from the start of each case to the step before its end."""
     states = replace(states_of(cases, np.arange(len(cases))), limits=np.full(len(cases), 77, np.int32))
-    found, unsolved = taught_by(cases, solver=name).demonstrate(states, steps)
+    found, unsolved = labeller_for(cases, solver=name).demonstrate(states, steps)
     assert unsolved == 0
     count = 0
     for t, case in enumerate(cases.instances):
@@ -283,7 +283,7 @@ def test_demonstrated_states_are_those_of_an_environment_that_follows_the_plans(
 def test_first_steps_of_plans_are_labelled_robot_by_robot_in_any_order(crowded, robot_order):
     """Whatever the order in which the expert is given the robots, labels lead through collision-free states."""
     states = states_of(crowded, np.arange(40))
-    found, unsolved = taught_by(crowded, robot_order=robot_order, node_limit=500).demonstrate(states, 5)
+    found, unsolved = labeller_for(crowded, robot_order=robot_order, node_limit=500).demonstrate(states, 5)
     assert unsolved == 0
     for t in range(40):
         own = found.take(np.flatnonzero(found.states.seeds == states.seeds[t]))

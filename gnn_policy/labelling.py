@@ -19,7 +19,7 @@ from mapf_env import MOVES, Action, Instance, Solution, States
 from mapf_env.hashing import mix
 
 
-class Teacher:
+class Labeller:
     """An expert that labels states on known maps.
 
     Args:
@@ -50,7 +50,7 @@ class Teacher:
     ) -> None:
         self._grids, self._w, self._robot_order = grids, w, robot_order
         self._node_limit, self._rounds, self._threads, self._clock = node_limit, rounds, threads, clock
-        self._solver = solver if solver in SOLVER_NAMES else import_by_name(solver, "the teacher", SOLVER_NAMES)
+        self._solver = solver if solver in SOLVER_NAMES else import_by_name(solver, "the expert", SOLVER_NAMES)
         self.seconds = 0.0
         """Time that it has taken to answer, so far."""
 
