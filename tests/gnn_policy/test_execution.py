@@ -41,9 +41,9 @@ def test_a_name_without_a_shield_has_the_one_that_is_given():
     assert Execution.parse("stuck") == Execution(actions="stuck")
 
 
-def test_different_variants_have_different_names():
+def test_different_executions_have_different_names():
     choices = itertools.product(
-        *([False, True, "stuck", "fallback"], [0.5, 1.0], ["idle", "pibt", "pibt_swap"]),
+        *(["argmax", "sampled", "stuck", "fallback"], [0.5, 1.0], ["idle", "pibt", "pibt_swap"]),
         *(["fixed", "connected", None], ["binary", "distance", None]),
     )
     fields = ("actions", "temperature", "shield", "comm_range", "comm_weights")
@@ -66,8 +66,8 @@ def test_different_variants_have_different_names():
         ("sampled,1,2", "temperature twice"),
         ("pibt,idle", "shield twice"),
         ("pibt,pibt_swap", "shield twice"),
-        ("argmax,0.5", "draws nothing"),
-        ("0.5", "draws nothing"),
+        ("argmax,0.5", "samples nothing"),
+        ("0.5", "samples nothing"),
         ("sampled,0", "temperature must be positive"),
         ("sampled,nan", "temperature must be positive"),
         ("sampled,inf", "temperature must be positive and finite"),
