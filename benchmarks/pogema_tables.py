@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich import box
@@ -83,13 +84,17 @@ def markdown(table: Table) -> str:
 
 
 def draw(path: Path, set_name: str, scores: Sequence[Score], published: Sequence[Published]) -> None:
-    """Write a figure: a panel for each measure of `DRAWN`, own methods with intervals, published means dashed."""
+    """Write a figure: a panel for each measure of `DRAWN`, own methods with intervals, published means dashed.
+
+    A method that several sources report has a line for each of them, in one colour.
+    """
     measures = [name for name in DRAWN if any(name in score.measures for score in scores)]
-    figure = Figure(figsize=(5.2 * len(measures), 4.6), layout="constrained")
+    figure = Figure(figsize=(4.6 * len(measures) + 2.2, 4.4), layout="constrained")
     panels = figure.subplots(1, len(measures), squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
         _panel(axes, measure, set_name, scores, published)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
+    lines = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))  # one for each label
+    figure.legend(lines.values(), lines.keys(), loc="outside right upper", fontsize="small")
     with replacing(path) as draft:
         figure.savefig(draft, format="png", dpi=120)
 
@@ -100,10 +105,14 @@ def _panel(axes: Axes, measure: str, set_name: str, scores: Sequence[Score], pub
         sizes = [score.num_agents for score in own]
         means = np.array([score.measures[measure].mean for score in own])
         bounds = np.array([(score.measures[measure].low, score.measures[measure].high) for score in own]).T
-        (line,) = axes.plot(sizes, means, "o-", markersize=4, label=method)
+        (line,) = axes.plot(sizes, means, "o-", markersize=5, linewidth=2, label=method)
         axes.fill_between(sizes, *bounds, alpha=0.2, color=line.get_color())
-    for (method, source), results in _by_method(published, set_name, measure).items():
-        axes.plot(list(results), list(results.values()), "--", linewidth=1, label=f"{method} ({source})")
+    by_method = _by_method(published, set_name, measure)
+    names = sorted({method for method, _ in by_method})
+    palette = colormaps["turbo"](np.linspace(0.05, 0.95, max(1, len(names))))
+    for (method, _), results in by_method.items():
+        colour = palette[names.index(method)]
+        axes.plot(list(results), list(results.values()), "--", linewidth=1, color=colour, label=method)
     axes.set(title=f"{set_name}: {LABELS[measure]}", xlabel="robots", ylim=(0, None))
     axes.grid(alpha=0.3)
 
