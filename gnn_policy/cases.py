@@ -150,7 +150,7 @@ def make_cases(split: Split, *, seed: int, maps: int, cases_per_map: int, famili
         raise ValueError(f"the {split} split needs at least one map and one case a map, got {maps} and {cases_per_map}")
     stream = mix(np.array([seed], np.uint64), np.array([get_args(Split).index(split)], np.uint64))
     map_seeds = mix(np.repeat(stream, maps), np.arange(maps, dtype=np.uint64))
-    family_of = _turns(np.array([each.share for each in families]), maps)
+    family_of = family_turns(families, maps)
     grids = _draw_maps([families[f] for f in family_of], map_seeds)
     map_of = np.repeat(np.arange(maps, dtype=np.int32), cases_per_map)
     numbers = np.tile(np.arange(cases_per_map, dtype=np.uint64), maps)
@@ -159,9 +159,10 @@ def make_cases(split: Split, *, seed: int, maps: int, cases_per_map: int, famili
     return Cases(_place(grids, map_of, robots, case_seeds), grids, map_of, family_of[map_of])
 
 
-def _turns(shares: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.int32]:
+def family_turns(families: Sequence[Family], count: int) -> npt.NDArray[np.int32]:
     """Return the family (count,) of each map: always the one that is furthest behind its share."""
-    shares = shares / shares.sum()
+    shares = np.array([family.share for family in families])
+    shares /= shares.sum()
     given = np.zeros(len(shares))
     turns = np.empty(count, np.int32)
     for number in range(count):

@@ -6,11 +6,11 @@ import math
 import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import tomli_w
 
-from gnn_policy.cases import Cases, Family, Split, Task, cases_of_files, make_cases
+from gnn_policy.cases import Cases, Family, Split, Task, cases_of_files, family_turns, make_cases
 from gnn_policy.execution import Actions, Execution
 from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.settings import check_types
@@ -201,6 +201,19 @@ class TrainConfig:
             raise ValueError(f"w must be at least 1 and finite, got {self.w}")
         if self.updates_per_round is not None and self.updates_per_round < 1:
             raise ValueError(f"updates_per_round must be at least 1, got {self.updates_per_round}")
+        if not self.files and len(self.case_families) > 1:
+            for split in get_args(Split):
+                self._require_a_map_of_each_family(split)
+
+    def _require_a_map_of_each_family(self, split: Split) -> None:
+        families, (maps, _) = self.case_families, self.size_of(split)
+        missing = {*range(len(families))} - {*family_turns(families, maps).tolist()}
+        if missing:
+            first = families[min(missing)]
+            raise ValueError(
+                f"{split}_maps = {maps} leaves {len(missing)} of {len(families)} families without a map, the first of "
+                f'them style "{first.style}" with share {first.share:g}: give more maps, or fewer families'
+            )
 
     @property
     def rollout_execution(self) -> Execution:

@@ -215,6 +215,17 @@ def test_the_cases_of_a_split_have_the_sizes_that_the_settings_say(split):
     assert len(mixed) == maps * cases_per_map
 
 
+@pytest.mark.parametrize("split", ["train", "validation", "test"])
+def test_a_split_that_leaves_a_family_without_a_map_is_refused(split):
+    rare = (Family(share=9.0), Family(style="maze", share=1.0))
+    enough = replace(CONFIG, train_maps=10, validation_maps=10, test_maps=10, families=rare)
+    assert set(enough.cases(split).family_of) == {0, 1}
+    with pytest.raises(
+        ValueError, match=f'{split}_maps = 4 leaves 1 of 2 families without a map, the first of them style "maze"'
+    ):
+        replace(enough, **{f"{split}_maps": 4})
+
+
 def test_the_cases_of_files_are_of_the_files_and_of_the_seed(tmp_path):
     save_map(tmp_path / "own.map", np.zeros((6, 7), bool))
     config = replace(CONFIG, files=(str(tmp_path),), families=MIXED.families)
