@@ -184,7 +184,7 @@ def outcome(options: Options, name: str, seed: int) -> dict[str, Any] | None:
     if not (folder / "outcome.json").exists():
         return None
     found = TrainConfig.load(folder / "config.toml")
-    config_of(options, name, seed).refuse_other(found, f"{folder} holds a run of", "--runs")
+    config_of(options, name, seed).require_same_settings(found, f"{folder} holds a run of", "--runs")
     return json.loads((folder / "outcome.json").read_text())
 
 

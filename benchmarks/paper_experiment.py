@@ -192,7 +192,7 @@ class Experiment:
         file = WEIGHTS / f"{model.name.replace('-k3', '')}.safetensors"
         if not file.exists():
             return None
-        model.config.refuse_other(checkpoint.trained_with(file), f"{file} holds a model of", "--folder")
+        model.config.require_same_settings(checkpoint.trained_with(file), f"{file} holds a model of", "--folder")
         return file
 
     def untrained(self) -> list[Model]:
@@ -207,7 +207,7 @@ class Experiment:
         """
         metrics, config = (self.run_of(model) / name for name in ("metrics.csv", "config.toml"))
         if config.exists():
-            model.config.refuse_other(TrainConfig.load(config), f"{self.run_of(model)} holds a model of", "--folder")
+            model.config.require_same_settings(TrainConfig.load(config), f"{self.run_of(model)} holds a model of", "--folder")
         return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.rounds
 
     def cases_per_map(self, scene: Scene) -> int:

@@ -1,4 +1,4 @@
-"""The pupil: a CNN-GNN policy that imitates an expert, its training loop and its evaluation."""
+"""A CNN-GNN policy that imitates an expert, its training loop and its evaluation."""
 
 import os
 import sys

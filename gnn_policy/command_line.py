@@ -1,4 +1,4 @@
-"""What the commands share: an error takes one line and exit status 2, and a device is checked before the work."""
+"""Shared parts of the commands: errors in one line with exit status 2, and a check of the device before the work."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ def _one_line(error: Exception) -> str:
 
 
 def on_device(policy: DecentralizedPolicy, device: str) -> DecentralizedPolicy:
-    """Move the policy to a device of PyTorch's, such as "cuda"; "auto" is the fastest that there is.
+    """Move the policy to a device of PyTorch's, such as "cuda"; "auto" is the fastest one available.
 
     Under torchrun each process takes the GPU of its number on the machine (LOCAL_RANK).
 
     Raises:
-        ValueError: If there is no such device, or it holds no numbers, as "meta".
+        ValueError: If the device does not exist, or holds no numbers, as "meta".
     """
     import torch
 

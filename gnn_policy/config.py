@@ -88,7 +88,7 @@ class TrainConfig:
     rounds: int = 150
     """Rounds of collecting and fitting; round 0 imitates the expert, the others aggregate what the policy visits."""
     updates_per_round: int | None = None
-    """Gradient steps in a round; without a number, one pass in which every demonstrated state is seen once."""
+    """Gradient steps in a round; if not given, one pass over all demonstrated states."""
     batch_size: int = 64
     """Team states in a gradient step."""
     batch_robots: int | None = None
@@ -97,42 +97,44 @@ class TrainConfig:
     demonstration_steps: int = 524_288
     """Team steps played in round 0, by the expert."""
     aggregation: Aggregation = "visited"
-    """What is aggregated: every "visited" state; plans from where teams are "stuck" at the end of their time, as the
+    """States to aggregate: every "visited" state; plans from where teams are "stuck" at the end of their time, as the
     authors' code does; or the first steps of "plans" from some of the visited states, which costs the expert least."""
     plan_steps: int = 24
     """Steps of each plan that are labelled in an aggregation of "plans"."""
     stuck_weight: float = 1.0
-    """How many times more often such a plan starts where a robot is stuck than where none is."""
+    """Weight of states with a stuck robot when the starts of such plans are drawn; other states have weight 1."""
     dagger_every: int = 4
     """Rounds from one aggregation to the next; 0 for plain imitation."""
     dagger_steps: int = 32_768
     """Team steps played in each aggregation, at least: as many times rollout_teams x rollout_length as that takes."""
     beta_decay: float = 0.0
-    """In round r a team step follows the expert with probability beta_decay ** r (DAgger's beta), else the policy."""
+    """DAgger's beta in round r is beta_decay ** r: the probability that a team step follows the expert, not the
+    policy."""
     fresh_share: float = 0.5
-    """With a number of steps: share of a batch drawn from the newest states; the rest comes from all of them."""
+    """Share of a batch drawn from the newest states if `updates_per_round` is given; the rest comes from all of
+    them."""
     fresh_window: int = 65_536
-    """How many states count as the newest."""
+    """Number of states that count as the newest."""
     kept_states: int | None = None
-    """How many of the newest states are kept; older ones are forgotten. All are kept if not given."""
+    """Number of newest states to keep; older ones are dropped. All are kept if not given."""
     rollout_length: int = 64
     """Steps that a team plays in a round."""
     rollout_teams: int = 128
-    """Teams that play side by side."""
+    """Teams that are played at the same time."""
     backend: Backend = "direct"
-    """Where TorchRL's collector plays: "direct" in this process, or "process", in as many others as `collectors`."""
+    """Where rollouts run: "direct" in this process, or "process" in as many other processes as `collectors`."""
     collectors: int = 1
-    """How many of them share a process's rollout_teams; each has a seed of its own."""
+    """Collectors that share the rollout_teams of one process; each has its own seed."""
     hard_case_mining: int = 1
-    """Team steps played for each one that is labelled; teams that did not arrive in the round are labelled first."""
+    """Team steps played for each labelled one; teams that did not arrive in the round are labelled first."""
     execution: Execution = Execution(actions="stuck")
-    """How the policy is executed; saved with the weights. Rollouts in training and validation play in the same way,
-    except for `rollout_actions`."""
+    """Execution of the policy, saved with the weights. Rollouts in training and validation use it too, except for
+    `rollout_actions`."""
     rollout_actions: Actions = "argmax"
-    """How robots choose their actions in rollouts of training and validation: "argmax", "sampled", "stuck" or
+    """Choice of actions in rollouts of training and validation: "argmax", "sampled", "stuck" or
     "fallback", as in `Execution.actions`."""
     augment: bool = False
-    """Turn and reflect every demonstrated state at random."""
+    """Rotate and reflect every demonstrated state at random."""
 
     optimizer: Optimizer = "adam"
     """"adamw" applies the weight decay to the weights, "adam" adds it to their gradients."""
@@ -159,10 +161,10 @@ class TrainConfig:
     threads: int = 0
     """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
     precision: Precision = "auto"
-    """In which numbers the network computes in training: "bfloat16", "float32", or "auto", the first where the
-    hardware has it."""
+    """Number format of the network in training: "bfloat16", "float32", or "auto" for bfloat16 where the hardware has
+    it."""
     device: str = "auto"
-    """Where the network computes: "cpu", "cuda", "mps", or "auto", the fastest that there is."""
+    """Device of the network: "cpu", "cuda", "mps", or "auto" for the fastest one available."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -217,7 +219,7 @@ class TrainConfig:
 
     @property
     def rollout_execution(self) -> Execution:
-        """How teams play in training and validation."""
+        """The execution in rollouts of training and validation."""
         return replace(self.execution, actions=self.rollout_actions)
 
     @property
@@ -253,23 +255,23 @@ class TrainConfig:
         )
 
     def size_of(self, split: Split) -> tuple[int, int]:
-        """The number of maps of a split, and of cases on each."""
+        """Return the number of maps of a split, and of cases on each."""
         return {
             "train": (self.train_maps, self.cases_per_map),
             "validation": (self.validation_maps, self.validation_cases_per_map),
             "test": (self.test_maps, self.cases_per_map),
         }[split]
 
-    def refuse_other(self, found: TrainConfig, what: str, option: str) -> None:
-        """Accept found settings only if they are these, except for `threads` and `device`.
+    def require_same_settings(self, found: TrainConfig, what: str, option: str) -> None:
+        """Check that found settings equal these, except for `threads` and `device`.
 
         Args:
-            found: The settings of what is there.
-            what: The place and what it holds, as "runs/quick holds a run with".
-            option: That of the command which names the folder.
+            found: The settings of the existing run or model.
+            what: Beginning of the message: the place and what it holds, as "runs/quick holds a run with".
+            option: The option of the command that names the folder.
 
         Raises:
-            FileExistsError: If others differ; it names them.
+            FileExistsError: If other settings differ; the message names them.
         """
         own, others = asdict(self), asdict(found)
         differ = [name for name in own if own[name] != others[name] and name not in ("threads", "device")]
@@ -282,7 +284,7 @@ class TrainConfig:
 
     @staticmethod
     def load(path: Path) -> TrainConfig:
-        """Read what `save` wrote, or a user wrote; settings that are not there have their defaults.
+        """Read settings from a TOML file; those that are missing have their defaults.
 
         Raises:
             ValueError: If the file is damaged or has settings that this version does not know.
@@ -324,7 +326,7 @@ class TrainConfig:
 
 
 def _settings(found: Any, kind: type, ignore_unknown: bool) -> dict[str, Any]:
-    """Return a table as arguments of a dataclass, its arrays as tuples."""
+    """Convert a TOML table to the arguments of a dataclass, with tuples for its arrays."""
     if not isinstance(found, dict):
         raise TypeError(f"expected a table of settings, got {type(found).__name__}")
     known = {each.name for each in fields(kind)}

@@ -1,4 +1,4 @@
-"""How many CPU threads this process may use."""
+"""The number of CPU threads this process may use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OWN_CGROUPS = Path("/proc/self/cgroup")
 def cpu_threads(asked: int, processes: int = 1) -> int:
     """Return the number of threads asked for, or for 0 as many as the process may use.
 
-    That is the least of the affinity mask's cores, the quota of its cgroups (version 1 or 2) and OMP_NUM_THREADS.
+    The latter is the least of the affinity mask's cores, the quota of its cgroups (version 1 or 2) and OMP_NUM_THREADS.
 
     Args:
         asked: A number, or 0.

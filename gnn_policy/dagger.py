@@ -109,7 +109,7 @@ def _collector(
 
 
 def teams_side_by_side(config: TrainConfig, ranks: Ranks) -> int:
-    """How many teams this process plays at a time.
+    """Return the number of teams that this process plays at a time.
 
     Raises:
         ValueError: If processes, or the collectors of a process, cannot share them evenly.

@@ -1,4 +1,4 @@
-"""What the expert would do in the states that were visited: states and moves, never observations."""
+"""Visited states with the expert's moves, as training data; observations are rebuilt when batches are drawn."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ class Demonstrations:
 
 
 class BatchMaker:
-    """Rebuilds what robots perceive in demonstrated states, under random symmetries of the world.
+    """Rebuilds what robots perceive in demonstrated states, under random symmetries of the grid.
 
     Args:
         grids: The training maps.
         senses: What the policy's robots perceive.
-        augment: Turn and reflect every state at random.
+        augment: Rotate and reflect every state at random.
         threads: CPU threads.
     """
 
@@ -124,8 +124,8 @@ class BatchMaker:
             demonstrations: The states to draw from.
             draws: The numbers of the states in each batch.
             rng: Draws the symmetries.
-            ahead: Make the next batch while the one before is in use. That pays where another device computes; a CPU
-                whose cores are all busy only loses time by it.
+            ahead: Prepare the next batch while the current one is in use. That is faster if another device computes,
+                and slower on a CPU whose cores are all busy.
         """
 
         def make(parts: Parts) -> list[TensorDict]:
@@ -169,7 +169,7 @@ class Filler:
         self._of_size = dict(zip(kinds.tolist(), np.split(order, first[1:]), strict=True))
 
     def __call__(self, robots: int) -> npt.NDArray[np.intp]:
-        """Return states with exactly so many robots, or with somewhat fewer where no team has the missing number."""
+        """Return states with exactly this number of robots, or a few less if no team has the missing number."""
         for _ in range(_ATTEMPTS):
             drawn, filled = self._draw(robots)
             for number in range(len(drawn), max(len(drawn) - 2, -1), -1):

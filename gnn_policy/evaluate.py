@@ -21,9 +21,9 @@ from mapf_env.generation import MapStyle
 
 @dataclass(frozen=True)
 class Command:
-    """Evaluate a policy next to the expert and baselines that learn nothing, on the same held-out cases.
+    """Evaluate a policy next to the expert and baselines without learning, on the same held-out cases.
 
-    What is not given is as the policy was trained. Results of other settings are never overwritten.
+    Settings that are not given are those of the policy's training. Results of other settings are never overwritten.
     """
 
     policy: Annotated[
@@ -33,16 +33,16 @@ class Command:
     num_agents: tuple[int, ...] = ()
     """Team sizes N, one table for each."""
     executions: tuple[str, ...] | None = None
-    """How to execute the policy, one row for each, in words with commas between them. "argmax", "sampled", "stuck"
-    (stuck robots and their neighbours sample) or "fallback" (stuck robots follow their shortest way); for the
-    latter three a temperature; the shield, "idle", "pibt" or "pibt_swap"; the radio's range, "fixed" or "connected"
-    (the radius grows until the team is connected); edge weights, "binary" or "distance". Where it does not say,
-    the policy's own execution does. If not given: argmax, stuck and sampled; for a policy that falls back, that and
-    argmax."""
+    """Executions of the policy, one row in the table for each. An execution is words joined by commas: "argmax",
+    "sampled", "stuck" (stuck robots and their neighbours sample) or "fallback" (stuck robots follow their shortest
+    path); a temperature for the latter three; the shield "idle", "pibt" or "pibt_swap"; the communication range "fixed"
+    or "connected" (the radius grows until the team is connected); the edge weights "binary" or "distance". Anything left
+    out is as in the policy's own execution. If not given: argmax, stuck and sampled, or fallback and argmax for a policy
+    whose own execution is "fallback"."""
     split: Literal["validation", "test"] = "test"
     """Which maps: "validation" to choose an execution, "test" to report it."""
     maps: int | None = None
-    """How many of them."""
+    """Number of maps."""
     cases_per_map: int | None = None
     """Cases on each of them."""
     height: int | None = None
@@ -52,7 +52,7 @@ class Command:
     density: float | None = None
     """Share of obstacles."""
     styles: tuple[MapStyle, ...] | None = None
-    """Obstacles: independent "cells", short "walls", or "maze", "room", "warehouse" and "empty", which heed no
+    """Obstacles: independent "cells", short "walls", or "maze", "room", "warehouse" and "empty", which ignore the
     density; the maps take turns among the styles."""
     files: tuple[str, ...] = ()
     """Your own maps (.map, .yaml), scenarios (.scen) and sets of instances (.json), or folders of them, instead of
@@ -64,21 +64,21 @@ class Command:
     data_seed: int | None = None
     """Random seed for the maps and cases; any seed gives maps that training with it does not use."""
     w: float | None = None
-    """Bound of the expert whose makespans set T_max and whose flowtimes are compared with."""
+    """Suboptimality bound of the expert, whose makespans set T_max and whose flowtimes are the reference."""
     timeout: float | None = None
     """T_max in makespans of the expert's solution."""
     seed: int | None = None
     """Random seed for sampling and for the shield's tie-breaking."""
     failures: int = 0
-    """How many cases of the first execution to replay next to the expert's solutions, in failures.html: the worst of
+    """Number of cases of the first execution to replay next to the expert's solutions, in failures.html: the worst of
     each kind of failure, then the next worst."""
     out: Path | None = None
-    """Folder for results.json and pictures; if not given, evaluation/ in the run folder or beside the file, and
+    """Folder for results.json and pictures; if not given, evaluation/ in the run folder or next to the file, and
     evaluation/NAME in the working folder for a policy that comes with the package."""
     threads: int = 0
     """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
     device: str = "auto"
-    """Where the network computes: "cpu", "cuda", "mps", or "auto", the fastest that there is."""
+    """Device of the network: "cpu", "cuda", "mps", or "auto" for the fastest one available."""
     plugins: tuple[str, ...] = ()
     """Encoders and graph layers of your own, as "module:Class", that the policy's file may import."""
     debug: bool = False
@@ -86,7 +86,7 @@ class Command:
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """The command that the arguments ask for."""
+    """Return the command that the arguments ask for."""
     return tyro.cli(Command, args=arguments, prog="python -m gnn_policy.evaluate")
 
 
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _evaluate(command: Command) -> None:
-    """Refuse what can be refused without torch, then evaluate."""
+    """Check everything that needs no torch, then evaluate."""
     trained = checkpoint.trained_with(command.policy)
     names = ("height", "width", "density", "styles", "data_seed", "w", "timeout", "seed")
     given = {name: value for name in names if (value := getattr(command, name)) is not None}

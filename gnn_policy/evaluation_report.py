@@ -58,9 +58,9 @@ def evaluate_and_report(
         split: Which maps.
         task: "lifelong" shows throughput, without the expert.
         steps: Steps of a lifelong episode.
-        whole: Play all cases of the files, also those that a training on them would have kept for itself.
+        whole: Play all cases of the files, including those that training on them would use.
         threads: CPU threads of the expert.
-        failures: How many cases of the first execution to show next to the expert's solutions, for each table, in
+        failures: Number of cases of the first execution to show next to the expert's solutions, for each table, in
             failures.html; the worst of each kind of failure come first. With them every table is computed.
 
     Raises:
@@ -70,7 +70,7 @@ def evaluate_and_report(
     if executions is None:
         executions = default_executions(policy.execution)
     if not executions:
-        raise ValueError("there is no way to execute the policy: give at least one row")
+        raise ValueError("executions is empty: give at least one execution")
     if failures < 0:
         raise ValueError(f"failures must not be negative, got {failures}")
     if failures and task == "lifelong":
@@ -140,6 +140,6 @@ def _animate(shown: Sequence[Rollouts], path: Path) -> None:
 
 
 def _worth_watching(played: Rollouts) -> int:
-    """The case of median length among the solved ones, or the first if none is solved."""
+    """Return the case of median length among the solved ones, or the first if none is solved."""
     solved = np.flatnonzero(played.success)
     return int(solved[np.argsort(played.makespan[solved], kind="stable")[len(solved) // 2]]) if len(solved) else 0

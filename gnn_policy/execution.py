@@ -1,4 +1,4 @@
-"""How a trained policy is executed: how its logits become moves, who keeps robots apart, and who hears whom."""
+"""The execution of a trained policy: choice of actions from logits, collision shield and communication."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _MOVES = np.uint64(2**32)  # what the draws are used for; the native core's uses
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Execution:
-    """One way to execute a policy; the defaults are the paper's.
+    """An execution of a policy; the defaults are the paper's.
 
     Raises:
-        ValueError: If a field is none of its values.
+        ValueError: If a field has an unknown value.
     """
 
     actions: Actions = "argmax"
-    """How a robot chooses its action. "argmax" takes the most probable one, "sampled" samples from the softmax. "stuck"
+    """The choice of a robot's action. "argmax" takes the most probable one, "sampled" samples from the softmax. "stuck"
     samples only while the robot or a neighbour is stuck, that is, off its goal and back on a cell of its last 16 steps.
     "fallback": a robot that is stuck itself prefers actions that shorten its path, then staying, as PIBT does, and
     breaks ties at random; a robot that is jammed (on at most three cells in its last 16 steps) samples among all
@@ -44,8 +44,8 @@ class Execution:
     """Collision shielding: "idle" is the paper's; "pibt" moves robots aside by priority and takes the logits as
     preferences."""
     comm_range: CommRange | None = None
-    """"fixed" r_COMM, or "connected": grown by 10 % at the start of a case until the team is connected, as in the
-    released code; as the policy was trained if None."""
+    """"fixed" r_COMM, or "connected": grown by 10 % at the start of an episode until the team is connected, as in the
+    authors' code; as the policy was trained if None."""
     comm_weights: CommWeights | None = None
     """Weights of the communication graph: "binary", or "distance" for 1 / distance; as trained if None."""
 
@@ -74,18 +74,18 @@ class Execution:
     ) -> Logits:
         """Return a score for each move; the greatest is taken, and PIBT takes their order.
 
-        A robot that draws adds Gumbel noise to its logits over the temperature: the greatest score is then a draw from
-        the softmax, and the order draws one move after another without replacement.
+        A robot that samples adds Gumbel noise to its logits over the temperature: the greatest score is then a sample
+        from the softmax, and the order samples one move after another without replacement.
 
         Args:
             logits: (M, 5) of robots.
             alarmed: (M,) robots that are stuck or, except for "fallback", hear a robot that is.
             noise: Returns Gumbel noise (m, 5) for the m robots that a mask (M,) selects.
-            greedy: (M, 5) the moves that shorten each robot's way, which the fallback reads.
-            jammed: (M,) robots that got nowhere for many steps, which the fallback reads.
+            greedy: (M, 5) the moves that shorten each robot's path, which "fallback" reads.
+            jammed: (M,) robots that made no progress for many steps, which "fallback" reads.
 
         Raises:
-            ValueError: If a logit, or a logit over the temperature, is not finite, or the fallback lacks what it reads.
+            ValueError: If a logit, or a logit over the temperature, is not finite, or "fallback" lacks its inputs.
         """
         if not np.isfinite(logits).all():
             raise ValueError(
@@ -111,15 +111,15 @@ class Execution:
 
     @property
     def features(self) -> tuple[str, ...]:
-        """The robot features that this way of execution reads itself."""
+        """The robot features that this execution reads itself."""
         return {"stuck": ("stuck",), "fallback": ("greedy_moves", "jammed", "stuck")}.get(self.actions, ())
 
     def robot_features(self, policy: PolicyConfig) -> tuple[str, ...]:
-        """Return what robots of `policy` know about themselves: what it reads, then what only the execution reads."""
+        """Return the robot features of `policy`, then those that only the execution reads."""
         return (*policy.robot_features, *(each for each in self.features if each not in policy.robot_features))
 
     def senses(self, policy: PolicyConfig) -> Senses:
-        """Return what robots of `policy` perceive when it is executed so."""
+        """Return what robots of `policy` perceive under this execution."""
         perceived: dict[str, Any] = policy.senses() | {"robot_features": self.robot_features(policy)}
         if self.comm_range is not None:
             perceived["comm_range"] = self.comm_range
@@ -128,7 +128,7 @@ class Execution:
         return Senses(**perceived)
 
     def env_settings(self, policy: PolicyConfig) -> dict[str, Any]:
-        """Return the settings of an environment in which `policy` is executed so: senses and shield."""
+        """Return the environment settings for `policy` under this execution: senses and shield."""
         return self.senses(policy).senses() | {"shield": self.shield}
 
     @property
@@ -165,8 +165,8 @@ class Execution:
 
 
 _TIER, _JAMMED = np.float32(1000.0), np.float32(2.0)
-"""What the scores of a move that shortens the way, of staying, and of other moves differ by: so much that no draw
-changes their order, or for a jammed robot so little that draws do."""
+"""Differences between the scores of a move that shortens the path, of staying, and of other moves. The first is so
+large that no noise changes their order; the second, for jammed robots, is small enough that noise does."""
 _OPTION_OF_WORD = {
     word: (option, word)
     for option, words in (

@@ -1,4 +1,4 @@
-"""Why a team failed, told from its executed paths alone."""
+"""The kind of a team's failure, found from its executed paths alone."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ MEANINGS: dict[Failure, str] = {
     "oscillation": "each stalled robot stays on at most two cells, some going to and fro",
     "livelock": "the stalled robots move about and get nowhere",
 }
-"""The kinds of failure, in the order in which they are asked for."""
+"""The kinds of failure, in the order in which they are tried."""
 
 LAST_STEPS = 16
-"""How many steps at the end of an episode tell why it failed."""
+"""Number of steps at the end of an episode from which the kind of failure is read."""
 
 
 def failure(instance: Instance, solution: Solution) -> Failure | None:
-    """The kind of failure, or None where all robots end on their goals.
+    """Return the kind of failure, or None if all robots end on their goals.
 
-    A robot is late if it ends off its goal, and stalled if it is late and came no nearer to its goal (by shortest ways
-    on the empty map) in the last steps than it had ever been before. The kind is the first of `MEANINGS` that holds.
+    A robot is late if it ends off its goal. It is stalled if it is late and in the last steps came no nearer to its
+    goal than it had ever been before (by shortest paths on the map without robots). The kind is the first of `MEANINGS`
+    that holds.
 
     Args:
         instance: The problem.
@@ -63,23 +64,23 @@ def failure(instance: Instance, solution: Solution) -> Failure | None:
 def _cut_off(
     instance: Instance, cell: npt.NDArray[np.int32], goal: npt.NDArray[np.int32], resting: npt.NDArray[np.bool_]
 ) -> bool:
-    """Whether no way leads from the cell to the goal around the robots that rest on their goals."""
+    """Return True if the robots that rest on their goals block every path from the cell to the goal."""
     blocked = instance.grid.copy()
     blocked[tuple(instance.goals[resting].T)] = True
     return bool(distances(blocked, goal[None].astype(np.int32))[0, cell[0], cell[1]] < 0)
 
 
 def count_failures(played: Rollouts) -> dict[Failure, int]:
-    """How many of the played cases failed in each of the ways."""
+    """Count the played cases by kind of failure."""
     found = Counter(failure(*case) for case in zip(played.instances, played.solutions, strict=True))
     return {kind: found[kind] for kind in get_args(Failure) if found[kind]}
 
 
 def worst(played: Rollouts, expert: Sequence[Solution], count: int) -> list[Scene]:
-    """Up to `count` of the played cases beside the expert's solutions, the worst of each kind of failure first.
+    """Return scenes of up to `count` played cases with the expert's solutions, the worst of each kind of failure first.
 
-    Then, as among these, failed cases come before solved ones, those with more robots off their goals before others,
-    then those whose flowtime exceeds the expert's by more.
+    A case is worse than another if it failed and the other did not, then if more robots are off their goals, then if
+    its flowtime exceeds the expert's by more.
     """
     cases = list(zip(played.instances, played.solutions, strict=True))
     kinds = [failure(*case) for case in cases]

@@ -1,4 +1,4 @@
-"""The expert, as training asks it: the joint move in each of many states, or the plan from there."""
+"""Labels for training: the expert's joint move in each of many states, or its plan from there."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class Labeller:
         solver: One of the solvers that `experts.solve_many` knows by name, or "module:function".
         w: ECBS's bound on suboptimality; other solvers are asked without one.
         robot_order: The order in which it is given the robots of a state; it breaks ties by that.
-        node_limit: ECBS's and LaCAM's effort for a state.
+        node_limit: Nodes that ECBS or LaCAM may generate for a state.
         rounds: Rounds of the neighbourhood search where the first steps of plans are labelled.
         threads: CPU threads.
         clock: The clock that `seconds` are measured by.
 
     Raises:
-        ValueError: If there is no such solver.
+        ValueError: If the solver is unknown.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Labeller:
         self._node_limit, self._rounds, self._threads, self._clock = node_limit, rounds, threads, clock
         self._solver = solver if solver in SOLVER_NAMES else import_by_name(solver, "the expert", SOLVER_NAMES)
         self.seconds = 0.0
-        """Time that it has taken to answer, so far."""
+        """Seconds spent in the expert so far."""
 
     def moves(self, states: States) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
         """Return the moves (R,) of all robots and which of the T states the expert solved; the others idle."""

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from mapf_env import Bag
 
 State = tuple[Tensor, ...]
-"""What a layer keeps for each of M robots between rounds: tensors (M, ...)."""
+"""The state that a layer keeps for each of M robots between rounds: tensors (M, ...)."""
 
 
 class Links(NamedTuple):
@@ -35,7 +35,7 @@ class MessageLayer(Protocol):
     """A graph layer that works by rounds of messages; all tensors hold one row for each robot or link."""
 
     rounds: int
-    """How many messages a robot sends in a step."""
+    """Number of messages a robot sends in a step."""
 
     def start(self, features: Tensor, links: Links) -> State:
         """Return the robots' first states from their features (M, F) and the links on which they hear."""

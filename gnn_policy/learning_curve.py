@@ -1,4 +1,4 @@
-"""What is recorded of each round of training, and its picture."""
+"""The metrics of each round of training, and their plot."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Round:
     validation_flowtime_increase: float | None = None
     """Flowtime increase on the validation cases, over all cases."""
     validation_throughput: float | None = None
-    """Arrivals a step on the validation cases of a lifelong training."""
+    """Arrivals per step on the validation cases of a lifelong training."""
 
     @property
     def validation(self) -> float | None:
@@ -56,7 +56,7 @@ def draw_learning_curve(rounds: Sequence[Round], path: Path) -> None:
     judged = [row for row in rounds if row.validation is not None]
     left.plot([row.samples / 1e6 for row in judged], [row.validation for row in judged], "o-", color="#1f6feb")
     if any(row.validation_throughput is not None for row in judged):
-        left.set(title="validation throughput", ylim=(0, None), ylabel="arrivals a step")
+        left.set(title="validation throughput", ylim=(0, None), ylabel="arrivals per step")
     else:
         left.set(title="validation success", ylim=(0, 1), ylabel="success rate")
     samples = [row.samples / 1e6 for row in rounds]

@@ -1,4 +1,4 @@
-"""How good a team is: the metrics of the paper, with intervals, for policies, baselines and the expert."""
+"""The metrics of the paper with confidence intervals, for policies, baselines and the expert."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Estimate:
 
     @staticmethod
     def proportion(outcomes: npt.NDArray[np.bool_]) -> Estimate:
-        """The share of true outcomes, with Wilson's interval."""
+        """Return the share of true outcomes, with Wilson's interval."""
         n, share, z = len(outcomes), float(outcomes.mean()), 1.96
         centre = (share + z * z / (2 * n)) / (1 + z * z / n)
         spread = z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n)) / (1 + z * z / n)
@@ -44,7 +44,7 @@ class Estimate:
 
     @staticmethod
     def average(values: npt.NDArray[np.float64]) -> Estimate:
-        """The mean, with the normal interval; not a number where there are no values."""
+        """Return the mean, with the normal interval; NaN without values."""
         if len(values) == 0:
             return Estimate(math.nan, math.nan, math.nan)
         mean = float(values.mean())
@@ -69,10 +69,10 @@ class ReferenceSet:
     def prepare(
         instances: Sequence[Instance], *, w: float, timeout: float, threads: int, nodes: int = REFERENCE_NODES
     ) -> ReferenceSet:
-        """Solve the cases by the expert; T_max is `timeout` times the makespan of its solution.
+        """Solve the cases with the expert; T_max is `timeout` times the makespan of its solution.
 
-        LaCAM plans the cases that ECBS leaves, also where ECBS has a plan without a proof. The cases that are solved
-        depend on `nodes`, not on the machine.
+        LaCAM plans the cases that ECBS does not solve, even if ECBS has a plan without a proof. Which cases are solved
+        depends on `nodes`, not on the machine.
 
         Args:
             instances: The cases.
@@ -115,7 +115,7 @@ class ReferenceSet:
         return np.array([each.sum_of_costs for each in self.solutions], np.int64)
 
     def increase(self, flowtimes: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
-        """(C,) by how much flowtimes exceed the expert's, as a share of it."""
+        """Return the excess (C,) of flowtimes over the expert's, as a share of the latter."""
         return (flowtimes - self.flowtimes) / np.maximum(self.flowtimes, 1)
 
 
@@ -137,7 +137,7 @@ class Score:
 
 
 def score(name: str, reference: ReferenceSet, rollouts: Rollouts) -> Score:
-    """The metrics of played cases."""
+    """Compute the metrics of played cases."""
     increase = reference.increase(rollouts.flowtime)
     return Score(
         name,
@@ -157,7 +157,7 @@ def compare(
     seed: int = 0,
     progress: Callable[[str], None] = lambda phase: None,
 ) -> tuple[list[Score], list[Rollouts]]:
-    """The results table of a policy beside the expert and baselines that learn nothing, on the same cases.
+    """Compare a policy with the expert and with baselines without learning, on the same cases.
 
     Returns:
         The rows, those of the executions first, and what the policy did in each execution.
@@ -174,13 +174,13 @@ def compare(
 
 
 BASELINES = ("random", "greedy*", "greedy,stuck*", "PIBT*", "expert*")
-"""The names of those that learn nothing; with a star they know the whole map."""
+"""The baselines without learning; those with a star know the whole map."""
 
 
 def baselines(
     reference: ReferenceSet, *, seed: int = 0, progress: Callable[[str], None] = lambda phase: None
 ) -> list[Score]:
-    """The rows of `BASELINES`: two greedy ones, the second of which moves at random where it is stuck."""
+    """Return the rows of `BASELINES`; of the two greedy ones, the second moves at random when it is stuck."""
     cases, rows = reference.instances, []
     actors = (RandomActor(), GreedyActor(), GreedyActor(random_when_stuck=True))
     for name, actor in zip(BASELINES, actors, strict=False):
@@ -219,7 +219,7 @@ def _expert_score(reference: ReferenceSet) -> Score:
 
 
 LIFELONG_BASELINES = {"random": RandomActor(), "greedy*": GreedyActor(), "PIBT*": GreedyActor(shield="pibt")}
-"""The rows of a lifelong table that learn nothing; with a star they know the whole map."""
+"""The baselines of a lifelong table; those with a star know the whole map."""
 
 
 def compare_lifelong(
@@ -257,7 +257,7 @@ def lifelong_table(title: str, result: dict[str, Any]) -> Table:
     caption = f"{result['cases']} cases of {result['steps']} steps, 95 % intervals; * knows the whole map"
     shown = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
     shown.add_column("", overflow="fold")
-    shown.add_column("arrivals\na step", justify="right", no_wrap=True)
+    shown.add_column("arrivals\nper step", justify="right", no_wrap=True)
     for row in result["rows"]:
         mean, high = row["throughput"]["mean"], row["throughput"]["high"]
         shown.add_row(row["name"], f"{mean:.3f} ±{math.inf if high is None else high - mean:.3f}")
@@ -265,7 +265,7 @@ def lifelong_table(title: str, result: dict[str, Any]) -> Table:
 
 
 def table(title: str, result: dict[str, Any]) -> Table:
-    """What `as_json` returns as a table for the terminal, at most 80 columns wide."""
+    """Return what `as_json` returns as a table for the terminal, at most 80 columns wide."""
     shown = Table(title=title, caption=_caption(result), box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
     shown.add_column("", overflow="fold")
     for heading in ("success rate", "flowtime\nincrease", "of solved\ncases", "make-\nspan", "lat-\nched"):
@@ -284,7 +284,7 @@ def table(title: str, result: dict[str, Any]) -> Table:
 
 
 def as_json(rows: Sequence[Score], reference: ReferenceSet) -> dict[str, Any]:
-    """The rows as plain data; null stands for what is not a finite number."""
+    """Return the rows as plain data, with null for numbers that are not finite."""
     plain = [_finite(asdict(row)) for row in rows]
     return {
         "cases": len(reference.instances),
@@ -301,7 +301,7 @@ def _finite(value: Any) -> Any:
 
 
 def _over_bound(reference: ReferenceSet) -> float:
-    """The expert's flowtime over its lower bound, the mean of the cases."""
+    """Return the expert's flowtime divided by its lower bound, as a mean over the cases."""
     return float((np.maximum(reference.flowtimes, 1) / np.maximum(reference.lower_bounds, 1)).mean())
 
 
@@ -309,7 +309,7 @@ def _caption(result: dict[str, Any]) -> str:
     lines = [
         f"{result['cases']} cases, 95 % intervals; T_max follows from the expert's makespan",
         f"the expert's flowtime is {result['expert_over_bound']:.4f} x its lower bound",
-        "stuck: robots draw where they are stuck; * knows the whole map",
+        "stuck: stuck robots sample their moves; * knows the whole map",
     ]
     if result["unsolved_by_expert"]:
         lines.append(f"{result['unsolved_by_expert']} more cases are left out: the expert did not solve them")

@@ -1,4 +1,4 @@
-"""`python -m gnn_policy.play FILE`: a policy on a map of one's own, as a page that replays it; no expert is needed."""
+"""`python -m gnn_policy.play FILE`: run a policy on your own map and write a page that replays it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gnn_policy.rollout import Rollouts
 
 PATIENCE = 4
-"""T_max in lengths of the longest way that a robot has to go."""
+"""T_max in lengths of the longest distance from a start to its goal."""
 
 
 @dataclass(frozen=True)
@@ -36,29 +36,30 @@ class Command:
     """A map (.map) in the MovingAI format, a scenario (.scen) next to its map, a set of instances (.json), maps of
     POGEMA (.yaml), or a folder of these."""
     agents: int | None = None
-    """How many robots: placed at random on a map, else the first ones of the file (all of them if not given)."""
+    """Number of robots: placed at random on a map, or the first ones of a file with robots (all of them if not
+    given)."""
     policy: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: general)")] = checkpoint.PACKAGED
     """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
     map: Path | None = None
-    """The map of a scenario, if it does not lie beside it."""
+    """The map of a scenario, if it is not next to it."""
     index: int | None = None
     """Which instance or map of a file, from 0; the first if not given."""
     execution: str | None = None
-    """How to execute the policy, written as for `--executions` of `python -m gnn_policy.evaluate`; if not given, the
+    """Execution of the policy, written as for `--executions` of `python -m gnn_policy.evaluate`; if not given, the
     execution saved with the policy."""
     task: Task = "one_shot"
     """"lifelong": a robot that arrives gets a new goal."""
     max_steps: int | None = None
-    """T_max; four times the longest way that a robot has to go if not given."""
+    """T_max; if not given, four times the longest distance from a start to its goal."""
     seed: int = 0
-    """Random seed for the robots' places, the draws and the shield's tie-breaking."""
+    """Random seed for placing robots, sampling moves and the shield's tie-breaking."""
     out: Path | None = None
-    """The page, which replaces a file of that name; if not given, the name of FILE with .html in the working folder, or
-    with a number if there is such a file."""
+    """The page to write; an existing file is replaced. If not given, the name of FILE with .html in the working folder,
+    with a number if that file exists."""
     threads: int = 0
     """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
     device: str = "auto"
-    """Where the network computes: "cpu", "cuda", "mps", or "auto", the fastest that there is."""
+    """Device of the network: "cpu", "cuda", "mps", or "auto" for the fastest one available."""
     plugins: tuple[str, ...] = ()
     """Encoders and graph layers of your own, as "module:Class", that the policy's file may import."""
     debug: bool = False
@@ -66,7 +67,7 @@ class Command:
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """The command that the arguments ask for."""
+    """Return the command that the arguments ask for."""
     return tyro.cli(Command, args=arguments, prog="python -m gnn_policy.play")
 
 
@@ -76,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _play(command: Command) -> None:
-    """Refuse what can be refused without torch, then play."""
+    """Check everything that needs no torch, then play."""
     threads = cpu_threads(command.threads)
     execution = checkpoint.executed_as(command.policy)
     if command.execution is not None:
@@ -160,7 +161,7 @@ def _outcome(task: Task, played: Rollouts, number: int) -> str:
     size = f"{instance.num_agents} robots on {instance.grid.shape[0]} x {instance.grid.shape[1]} cells"
     steps = len(solution.paths) - 1
     if task == "lifelong":
-        return f"{size}: {played.throughput[number]:.2f} arrivals a step over {steps} steps"
+        return f"{size}: {played.throughput[number]:.2f} arrivals per step over {steps} steps"
     home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
     kind = failure(instance, solution)
     end = f"flowtime {solution.sum_of_costs}" if kind is None else f"failed: {kind}"

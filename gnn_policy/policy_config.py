@@ -1,4 +1,4 @@
-"""What defines a policy besides its weights; importable without torch."""
+"""The configuration that defines a policy apart from its weights; importable without torch."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class PolicyConfig(Senses):
     3 convolutions without poolings and costs a third; or a class of your own as "module:Class", made as `lean_encoder`
     is."""
     graph_layer: str = "filter"
-    """How robots use what they hear: "filter" is the paper's graph filter, "attention" weighs messages by edge
+    """The use of messages: "filter" is the paper's graph filter, "attention" weighs messages by edge
     features; or a class of your own as "module:Class", made and called as `GraphFilter` is."""
     features: int = 128
     """Features F that a robot extracts and communicates."""
     taps: int = 3
-    """Filter taps K: K - 1 rounds of messages; K = 1 is no communication."""
+    """Filter taps K: K - 1 rounds of messages; K = 1 means no communication."""
 
     def __post_init__(self) -> None:
         Senses.__post_init__(self)

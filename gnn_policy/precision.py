@@ -17,7 +17,7 @@ def autocast(precision: Precision, device: torch.device) -> torch.autocast:
 
 
 def resolved(precision: Precision, device: torch.device) -> Precision:
-    """What "auto" is on `device`; others are what they are."""
+    """Return the precision that "auto" means on `device`; other precisions stay the same."""
     if precision == "auto":
         return "bfloat16" if _has_bfloat16(device) else "float32"
     return precision

@@ -1,4 +1,4 @@
-"""What a person sees while training runs."""
+"""The progress display of training."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class TrainingProgress:
         self._bar.__exit__(kind, error, trace)
 
     def phase(self, number: int, phase: str) -> None:
-        """Say what round `number` is doing."""
+        """Show the current phase of round `number`."""
         self._bar.update(self._task, completed=number, phase=phase)
 
     def due(self) -> bool:
@@ -65,7 +65,7 @@ class TrainingProgress:
         self._bar.update(self._task, completed=number + update / updates, phase="fitting", figures=figures)
 
     def finished(self, row: Round) -> None:
-        """A round is done and saved."""
+        """Show a round that is finished and saved."""
         self._bar.update(self._task, completed=row.round + 1)
         if row.validation is not None:
             self._validation = f"{row.validation:.3f}"

@@ -1,4 +1,4 @@
-"""The processes that train one policy together, as torchrun starts them; one process alone is a team of one."""
+"""The processes that train one policy together, as torchrun starts them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class Ranks:
     """This process among those that train together."""
 
     rank: int = 0
-    """Its number; 0 writes the run folder and speaks to the user."""
+    """Number of this process; process 0 writes the run folder and prints to the console."""
     count: int = 1
-    """How many there are, on all machines."""
+    """Number of processes on all machines."""
     local_count: int = 1
-    """How many there are on this machine."""
+    """Number of processes on this machine."""
 
     def share(self, name: str, total: int) -> int:
-        """The part of each process of `total`.
+        """Return the share of each process in `total`.
 
         Raises:
             ValueError: If it cannot be divided evenly.
@@ -39,7 +39,7 @@ class Ranks:
         return total // self.count
 
     def gather(self, value: T) -> list[T]:
-        """The values of all processes, in their order."""
+        """Return the values of all processes, in their order."""
         if self.count == 1:
             return [value]
         values: list[T | None] = [None] * self.count
@@ -47,7 +47,7 @@ class Ranks:
         return values  # pyright: ignore[reportReturnType]
 
     def from_first(self, value: T) -> T:
-        """The value of process 0."""
+        """Return the value of process 0."""
         if self.count == 1:
             return value
         values = [value]
@@ -55,20 +55,20 @@ class Ranks:
         return values[0]
 
     def average(self, tensor: torch.Tensor) -> torch.Tensor:
-        """The mean over the processes, in place."""
+        """Average a tensor over the processes, in place."""
         if self.count > 1:
             distributed.all_reduce(tensor)
             tensor /= self.count
         return tensor
 
     def average_gradients(self, module: nn.Module) -> nn.Module:
-        """`module` whose backward pass averages gradients; batch norm's statistics follow those of process 0."""
+        """Wrap `module` so that its backward pass averages gradients; batch norm follows the statistics of process 0."""
         return DistributedDataParallel(module) if self.count > 1 else module
 
 
 @contextmanager
 def join_ranks() -> Iterator[Ranks]:
-    """Meet the other processes that `torchrun` started, over nccl between GPUs and gloo otherwise; alone without it."""
+    """Join the other processes that `torchrun` started (nccl between GPUs, gloo otherwise); without it, run alone."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Ranks()
         return

@@ -71,7 +71,7 @@ def tables_of(config: TrainConfig, num_agents: Sequence[int]) -> dict[str, Train
 
 
 def refuse_other_settings(path: Path, settings: dict[str, Any], option: str) -> None:
-    """Accept a file of results only if it is missing, or has these settings.
+    """Check that a file of results is missing or has these settings.
 
     Args:
         path: The file.

@@ -24,7 +24,7 @@ Features = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Message:
-    """What a robot sends to all its neighbours in one round."""
+    """The message that a robot sends to all its neighbours in one round."""
 
     features: Features
     """(G,) the message of the policy's graph layer."""
@@ -64,8 +64,8 @@ class Robot:
 
     Args:
         policy: The policy; its weights are shared, and it is put into evaluation mode.
-        execution: How it chooses moves, the policy's own if not given; shield and communication range are matters of
-            the world and ignored here.
+        execution: The choice of actions, the policy's own if not given; shield and communication range belong to
+            the environment and are ignored here.
         seed: Seed of its draws; robots of one team need different ones.
 
     Raises:
@@ -121,7 +121,7 @@ class Robot:
         """Start a step; anything left of another is dropped.
 
         Args:
-            view: (C, S, S) what it sees, as `mapf_env` shows it.
+            view: (C, S, S) its field of view, as `mapf_env` makes it.
             links: The weights of the links to the neighbours that it hears, by whatever names they have: 1, or 1 /
                 distance for a policy whose comm_weights are "distance".
             cell: Row and column of where it stands, in any frame that stays the same, such as its odometry's.
@@ -165,7 +165,7 @@ class Robot:
 
     @property
     def message(self) -> Message:
-        """What it sends to its neighbours in this round."""
+        """The message for its neighbours in this round."""
         if not 0 <= self._round < self.rounds:
             raise RuntimeError(f"there are {self.rounds} rounds in a step: begin() the next step or act()")
         with torch.inference_mode():
@@ -227,7 +227,7 @@ class Robot:
         )[0]
 
     def act(self) -> int:
-        """Return the move that it wants, 0..4, the one with the greatest score; the world's shield has the last word.
+        """Return the move that it wants, 0..4, the one with the greatest score; the environment's shield decides.
 
         Raises:
             RuntimeError: If rounds are missing.

@@ -1,4 +1,4 @@
-"""Teams under a policy, from their starts to the end: the executed paths and how good they are."""
+"""Rollouts of teams under a policy: executed paths and their quality."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mapf_env import Action, BatchedEnv, Instance, Solution, arguments
 from mapf_env.hashing import mix
 
 _MOST_BYTES = 2**28
-"""Memory for the distance tables of teams that play side by side."""
+"""Limit on the memory for the distance tables of teams that are played at the same time."""
 
 
 @runtime_checkable
@@ -94,7 +94,7 @@ class Rollouts:
     replaced: npt.NDArray[np.float64]
     """(C,) the share of actions that the shield replaced."""
     throughput: npt.NDArray[np.float64]
-    """(C,) arrivals of all robots a step."""
+    """(C,) arrivals of all robots per step."""
 
 
 def rollout(
@@ -116,14 +116,14 @@ def rollout(
     Args:
         policy: A policy; or a network of your own that maps a bag of robots (`mapf_env.Bag`, as tensors) to logits
             (M, 5) and has a `config`, a `PolicyConfig` that says what its robots perceive; or an `Actor`.
-        instances: The problems.
+        instances: The problems to play.
         task: "one_shot", or "lifelong": a robot that arrives gets a new goal, until max_steps.
-        execution: How moves are chosen from logits, the shield and the radio; the policy's own (`policy.execution`) if
+        execution: The choice of actions, the shield and the communication; the policy's own (`policy.execution`) if
             not given. An `Actor` brings its own settings.
         message_loss: The probability that a link fails in a step.
-        seed: Seed of the draws and of the shield's tie-breaking, one for all instances or one for each.
+        seed: Random seed for sampling and the shield's tie-breaking, one for all instances or one for each.
         max_steps: T_max, one for all instances or one for each.
-        batch_size: How many teams are played at a time, at most; it does not change the outcome.
+        batch_size: Maximum number of teams to play at a time; it does not change the outcome.
 
     Raises:
         ValueError: If an argument is out of range, or the policy needs more memory than there is for one team.
@@ -194,7 +194,7 @@ def _seeds(instances: Sequence[Instance], seeds: Sequence[int]) -> npt.NDArray[n
 
 
 def _batches(instances: Sequence[Instance], batch_size: int, task: Task) -> Iterator[npt.NDArray[np.intp]]:
-    """Yield the numbers of instances to play side by side: of similar sizes, as arrays are as large as the largest.
+    """Yield the numbers of instances to play together: of similar sizes, as arrays are as large as the largest.
 
     Instances that are solved at the start are left out of one-shot tasks. In lifelong tasks the maps of a batch have
     one size: new goals are drawn on the map as it is filled up.
@@ -229,9 +229,9 @@ class _Played:
     goals: npt.NDArray[np.int32]
     """(T + 1, n, 2), or (1, n, 2) where they never change."""
     replaced: int
-    """How many actions the shield replaced."""
+    """Number of actions that the shield replaced."""
     arrivals: npt.NDArray[np.int64]
-    """(n,) how often each robot has moved onto its goal."""
+    """(n,) number of times each robot has moved onto its goal."""
 
     @staticmethod
     def at_once(instance: Instance) -> _Played:
@@ -246,7 +246,7 @@ def _play(
     limits: npt.NDArray[np.int64],
     settings: dict[str, Any],
 ) -> list[_Played]:
-    """Play instances side by side until the last team has ended."""
+    """Play instances together until the last team has ended."""
     lifelong = settings["task"] == "lifelong"
     env = BatchedEnv(
         len(instances),

@@ -1,4 +1,4 @@
-"""Run folders of training: one process at a time, one set of settings, never trained over."""
+"""Run folders of training: one process at a time, one set of settings, never overwritten."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gnn_policy.results_file import read_tables, tables_of
 from mapf_env.files import remove_drafts
 
 RESULTS = "results.json"
-"""The last file of a run: with it, the run is finished."""
+"""The last file that a run writes: a run that has it is finished."""
 
 
 class RunLockedError(FileExistsError):
@@ -60,8 +60,8 @@ def check_run(folder: Path, config: TrainConfig) -> None:
     if folder.is_dir() and all(each.name.startswith(".") for each in folder.iterdir()):  # empty, or drafts at most
         return
     if not (folder / "config.toml").is_file():
-        raise FileExistsError(f"{folder} exists and is no training run: choose another folder with --run")
-    config.refuse_other(TrainConfig.load(folder / "config.toml"), f"{folder} holds a run with", "--run")
+        raise FileExistsError(f"{folder} exists and is not a training run: choose another folder with --run")
+    config.require_same_settings(TrainConfig.load(folder / "config.toml"), f"{folder} holds a run with", "--run")
     if (folder / RESULTS).exists():
         raise FileExistsError(
             f"{folder} holds a finished run: evaluate it with `python -m gnn_policy.evaluate {folder}`, "
@@ -78,5 +78,5 @@ def is_finished(folder: Path, config: TrainConfig) -> bool:
     finished = read_tables(folder / RESULTS).keys()
     if not (folder / "config.toml").is_file() or not tables_of(config, ()).keys() <= finished:
         return False
-    config.refuse_other(TrainConfig.load(folder / "config.toml"), f"{folder} holds a run with", "--run")
+    config.require_same_settings(TrainConfig.load(folder / "config.toml"), f"{folder} holds a run with", "--run")
     return True

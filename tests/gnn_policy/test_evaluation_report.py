@@ -1,4 +1,4 @@
-"""What an evaluation_report leaves behind."""
+"""The files that an evaluation leaves behind."""
 
 import io
 import json

@@ -154,7 +154,7 @@ def test_a_folder_that_is_taken_is_refused_in_one_line(tmp_path, capsys):
         train.main(["--run", str(tmp_path), "--train-maps", "2"])
     assert end.value.code == 2
     assert capsys.readouterr().err == (
-        f"error: {tmp_path} exists and is no training run: choose another folder with --run\n"
+        f"error: {tmp_path} exists and is not a training run: choose another folder with --run\n"
     )
 
 

@@ -379,9 +379,9 @@ def test_an_expert_that_labels_nothing_is_reported(tmp_path, monkeypatch):
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(FileExistsError, match=r"is no training run.*--run"):
+    with pytest.raises(FileExistsError, match=r"is not a training run.*--run"):
         open_run(tmp_path, CONFIG)
-    with pytest.raises(FileExistsError, match=r"thesis\.tex .*is no training run.*--run"):
+    with pytest.raises(FileExistsError, match=r"thesis\.tex .*is not a training run.*--run"):
         open_run(tmp_path / "thesis.tex", CONFIG)
     assert os.listdir(tmp_path) == ["thesis.tex"]
 
