@@ -134,12 +134,12 @@ double agent_steps_per_second(int num_envs, int num_agents, int size, double den
     return sum;
 }
 
-int main(int count, char** values) {
+int main(int count, char** arguments) {
     if (count != 9) return 2;
-    const int num_envs = std::atoi(values[1]), num_agents = std::atoi(values[2]), size = std::atoi(values[3]);
-    const double density = std::atof(values[4]), seconds = std::atof(values[5]);
-    const bool stores = std::string(values[7]) == "stores";
-    const auto measure = std::string(values[6]) == "uint8" ? agent_steps_per_second<std::uint8_t>
+    const int num_envs = std::atoi(arguments[1]), num_agents = std::atoi(arguments[2]), size = std::atoi(arguments[3]);
+    const double density = std::atof(arguments[4]), seconds = std::atof(arguments[5]);
+    const bool stores = std::string(arguments[7]) == "stores";
+    const auto measure = std::string(arguments[6]) == "uint8" ? agent_steps_per_second<std::uint8_t>
                                                             : agent_steps_per_second<float>;
-    std::printf("%f\n", measure(num_envs, num_agents, size, density, seconds, stores, std::atoi(values[8])));
+    std::printf("%f\n", measure(num_envs, num_agents, size, density, seconds, stores, std::atoi(arguments[8])));
 }

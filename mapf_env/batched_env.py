@@ -22,16 +22,16 @@ _NO_WAY = np.iinfo(np.uint16).max
 
 
 class Observation(NamedTuple):
-    """What the robots of B teams perceive; C, K and D follow from the settings."""
+    """Observations of the robots of B teams; C, K and D follow from the settings."""
 
     fov: npt.NDArray[Any]
     """(B, N, C, F, F) fields of view."""
     graph: npt.NDArray[np.float32]
-    """(B, N, N) communication graph; row i says whom robot i hears."""
+    """(B, N, N) communication graph; row i has the robots that robot i hears."""
     scalars: npt.NDArray[np.float32]
-    """(B, N, K) what each robot knows about itself, by the setting `robot_features`."""
+    """(B, N, K) features of each robot, as the setting `robot_features` names them."""
     edge_attr: npt.NDArray[np.float32]
-    """(B, N, N, D) what robot i knows about each robot j that it hears, by `edge_features`; 0 if it does not hear j."""
+    """(B, N, N, D) features of robot j as heard by robot i, as `edge_features` names them; 0 if i does not hear j."""
 
 
 Seen = TypeVar("Seen", bound=Observation | None)
@@ -41,17 +41,17 @@ class Step(NamedTuple, Generic[Seen]):
     """The outcome of one joint step of B teams."""
 
     observation: Seen
-    """What the robots perceive after the step; None after a step without observation."""
+    """The observation after the step; None after a step without observation."""
     rewards: npt.NDArray[np.float32]
     """(B, N) by default 0 for a robot that is on its goal after the step, else -1.
 
-    If no robot leaves its goal again, a team's undiscounted return is its negated flowtime but for a constant, the
-    number of robots that did not start on their goals: the step that arrives is free.
+    If no robot leaves its goal again, a team's undiscounted return is the number of robots that did not start on their
+    goals minus its flowtime, because the step that arrives costs nothing.
     """
     terminated: npt.NDArray[np.bool_]
     """(B,) all robots of the team are on their goals at once; never in lifelong tasks."""
     truncated: npt.NDArray[np.bool_]
-    """(B,) max_cycles is reached without that."""
+    """(B,) max_cycles is reached and the team is not terminated."""
     replaced: npt.NDArray[np.bool_]
     """(B, N) the shield replaced the robot's action."""
     arrived: npt.NDArray[np.bool_]
@@ -63,20 +63,20 @@ class Step(NamedTuple, Generic[Seen]):
 class BatchedEnv:
     """B environments in arrays; the settings are the fields of `EnvConfig`.
 
-    All robots of a team live until its joint end. A team that has ended must be reset before the next step, unless
-    `autoreset` does it.
+    All robots of a team act until the team's episode ends. A team that has ended must be reset before the next step,
+    unless `autoreset` does that.
 
     Args:
         num_envs: The number of environments B.
-        threads: Over how many threads the environments of a step are spread; it changes no result.
-        autoreset: As in Gymnasium: DISABLED; NEXT_STEP, the step after the end ignores the actions, which must be valid
-            all the same, and begins the next episode; or SAME_STEP, the step that ends returns the first observation of
-            the next episode, and `Step.final_observation` has the last ones of those that ended.
+        threads: Threads that share the environments of a step; results do not depend on it.
+        autoreset: As in Gymnasium: DISABLED; NEXT_STEP, where the step after the end ignores its actions (which must
+            be valid) and begins the next episode; or SAME_STEP, where the step that ends returns the first observation
+            of the next episode, and `Step.final_observation` has the last one of those that ended.
         cases: Instances to play, drawn at each reset by the seed, instead of random ones.
         grid: The map (H, W) of all episodes, True is an obstacle; starts and goals are drawn. It sets height and width.
-        fill: Take instances that are smaller than the environment too: the map is filled up with obstacles, and the
-            robots that are not there have zeros everywhere, but for the action mask, which leaves them idle, so that a
-            masked choice is always defined; `present` says which are there.
+        fill: Take instances that are smaller than the environment too: the map is filled up with obstacles. Absent
+            robots have zeros everywhere, except that their action mask allows idle, so a masked choice is always
+            defined; `present` tells which robots are there.
         settings: Fields of `EnvConfig`.
 
     Raises:
@@ -116,9 +116,9 @@ class BatchedEnv:
         self._bind()
 
     def on_maps_of(self, config: EnvConfig, shape: tuple[int, int]) -> BatchedEnv:
-        """Return environments for maps of `shape` whose streams of seeds go on from here; these, if they fit.
+        """Return environments for maps of `shape` that continue these streams of seeds; `self` if the shape fits.
 
-        They have the settings of `config`. On maps of another size than it names only given instances can be played.
+        They have the settings of `config`. On maps of another size only given instances can be played.
         """
         if shape == (self.config.height, self.config.width):
             return self
@@ -158,12 +158,12 @@ class BatchedEnv:
 
     @property
     def positions(self) -> npt.NDArray[np.int32]:
-        """(B, N, 2) where the robots stand; a copy."""
+        """(B, N, 2) the robots' positions; a copy."""
         return self._state.positions.copy()
 
     @property
     def goals(self) -> npt.NDArray[np.int32]:
-        """(B, N, 2) where the robots want to go; a copy."""
+        """(B, N, 2) the robots' goals; a copy."""
         return self._state.goals.copy()
 
     @property
@@ -183,7 +183,7 @@ class BatchedEnv:
 
     @property
     def team_sizes(self) -> npt.NDArray[np.int32]:
-        """(B,) how many robots are there; a copy."""
+        """(B,) number of robots in each team; a copy."""
         return self._state.team_sizes.copy()
 
     @property
@@ -205,8 +205,8 @@ class BatchedEnv:
     def present(self) -> npt.NDArray[np.bool_]:
         """(B, N) which robots are there.
 
-        Like all properties that is the state now. With autoreset SAME_STEP a step that ends leaves the next episode
-        here: what was read before the step says whom its rewards and its `final_observation` are of.
+        Properties show the current state. With autoreset SAME_STEP, read `present` before the step to know whose
+        rewards and `final_observation` the step returns.
         """
         return np.arange(self.num_agents) < self._state.team_sizes[:, None]
 
@@ -217,11 +217,11 @@ class BatchedEnv:
 
     @property
     def began(self) -> bool:
-        """Whether all environments have been reset."""
+        """True if all environments have been reset."""
         return bool(self._state.started.all())
 
     def buffers(self) -> Observation:
-        """Memory for observations, to be given as `out`."""
+        """Allocate arrays for observations, to be passed as `out`."""
         return Observation(
             np.empty(self._fov_shape, self._dtype),
             np.empty(self._graph_shape, _FLOAT),
@@ -263,14 +263,14 @@ class BatchedEnv:
         out: Observation | None = None,
         observe: bool = True,
     ) -> Observation | None:
-        """Begin new episodes and return what the robots perceive.
+        """Begin new episodes and return their observation.
 
         Args:
             seed: Restarts the random streams of the environments that are reset: environment b gets seed + b, or the
                 b-th of a sequence of B. Without a seed each goes on with its stream (the first time, from a random
                 seed).
-            instances: One instance for each environment that is reset, in place of random ones.
-            mask: (B,) which environments begin anew; all if not given. The others go on undisturbed.
+            instances: One instance for each environment that is reset, instead of random ones.
+            mask: (B,) the environments to reset; all if not given. The others continue undisturbed.
             max_cycles: Steps after which these episodes are truncated, one number or one for each of the B
                 environments; by default the setting of that name.
             out: Where to write the observation of all environments, as for `step`.
@@ -279,7 +279,7 @@ class BatchedEnv:
         Raises:
             ValueError: If a length or shape does not fit, or an instance is of another size than the environment;
                 the environments are then as they were.
-            TypeError: If a seed is no integer, an instance none, or the memory of another dtype.
+            TypeError: If a seed is not an integer, an instance is not an `Instance`, or `out` has the wrong dtype.
         """
         arguments.flag(observe, "observe")
         chosen = np.arange(self.num_envs) if mask is None else np.flatnonzero(self._checked_mask(mask))
@@ -324,20 +324,20 @@ class BatchedEnv:
         """Shield and execute the joint actions (B, N), integers 0..4.
 
         Args:
-            actions: One of the five actions for each robot; under the shield "pibt" alternatively a value for each of
-                them, (B, N, 5), for example logits: the greatest is wanted most.
-            out: Where to write the observation, NumPy arrays or torch tensors on the CPU shaped as in `buffers()`; it
-                is what is returned then. Fresh arrays if not given.
+            actions: One of the five actions for each robot; under the shield "pibt" alternatively a score for each of
+                them, (B, N, 5), for example logits: the greatest is preferred.
+            out: Arrays for the observation (NumPy arrays or torch tensors on the CPU, shaped as in `buffers()`), which
+                are then returned. New arrays if not given.
             observe: False writes no observation, for loops that use `bag`; teams that have ended are then left as they
                 are, whatever their actions.
 
         Raises:
             ValueError: If the shape is wrong or an action is out of range.
-            TypeError: If the actions are not integers, or the memory is of another dtype.
+            TypeError: If the actions are not integers, or `out` has the wrong dtype.
             RuntimeError: Before the first reset, or, if the step is observed, if a team has ended and was not reset.
         """
         if not arguments.flag(observe, "observe") and out is not None:
-            raise ValueError("a step without observation needs no memory for it: leave out the argument out")
+            raise ValueError("a step without observation needs no arrays for it: leave out the argument out")
         observation = (self.buffers() if out is None else out) if observe else None
         final = self.advance(arguments.numbers(actions, "actions"), observation)
         state = self._state
@@ -352,7 +352,7 @@ class BatchedEnv:
         )
 
     def assign_goals(self, goals: npt.ArrayLike) -> None:
-        """Give robots other goals between two steps, as a dispatcher of tasks does; `observe` then shows them.
+        """Set the robots' goals between two steps, as a task dispatcher does; `observe` then shows them.
 
         In lifelong tasks these goals replace those that the environment has drawn for robots that have arrived. Two
         robots may have the same goal.
@@ -381,7 +381,7 @@ class BatchedEnv:
         state.on_goal[changed] = (state.positions == state.goals).all(axis=2)[changed]
 
     def _distances_to(self, b: int, robots: npt.NDArray[np.intp], goals: npt.NDArray[np.int32]) -> npt.NDArray[Any]:
-        """Tables of steps (K, size) to the goals of K robots of team b, which must be free and within reach."""
+        """Return distance tables (K, size) to the goals of K robots of team b, which must be free and reachable."""
         state, border = self._state, self.config.fov_radius
         height, width = state.grids.shape[1:]
         for robot in robots.tolist():
@@ -398,7 +398,7 @@ class BatchedEnv:
         return table
 
     def advance(self, actions: npt.NDArray[Any], out: Observation | None) -> Observation | None:
-        """`step` without copies of the outcome, which stands in the state; returns the final observation."""
+        """Do `step` without copying the outcome, which stays in the state; return the final observation."""
         if self.autoreset is AutoresetMode.DISABLED:
             self._execute(actions, out, skip_ended=out is None and self.began)
             return None
@@ -419,7 +419,7 @@ class BatchedEnv:
     def _execute(self, actions: npt.NDArray[Any], out: Observation | None, *, skip_ended: bool) -> None:
         step: Callable[..., None]
         if actions.ndim == 3:
-            step, wanted = self.stepper.step_by_values, rules.as_values(actions)
+            step, wanted = self.stepper.step_by_scores, rules.as_scores(actions)
         elif actions.ndim == 2:
             step, wanted = self.stepper.step, rules.as_actions(actions)
         else:
@@ -427,7 +427,7 @@ class BatchedEnv:
         step(wanted, out, skip_ended)
 
     def observe(self, out: Observation | None = None) -> Observation:
-        """What the robots perceive now.
+        """Return the current observation.
 
         Raises:
             RuntimeError: Before the first reset.
@@ -445,9 +445,9 @@ class BatchedEnv:
         self.stepper.observe(out, chosen)
 
     def bag(self, mask: npt.NDArray[np.bool_] | None = None) -> Bag:
-        """What the robots of the teams that are under way perceive, as one bag; `Bag.team` is the environment.
+        """Return the observation of the running teams as one bag; `Bag.team` is the environment.
 
-        A team is under way from its reset to its end.
+        A team runs from its reset to its end.
 
         Args:
             mask: (B,) take only these of them.
@@ -455,7 +455,7 @@ class BatchedEnv:
         return Bag(*self.stepper.bag(None if mask is None else self._checked_mask(mask)))
 
     def states(self, mask: npt.NDArray[np.bool_] | None = None) -> States:
-        """The joint states of all teams, or of those of `mask` (B,), as copies; `States.maps` is the environment.
+        """Return copies of the joint states of all teams, or of those in `mask` (B,); `States.maps` is the environment.
 
         Raises:
             RuntimeError: Before the first reset.
@@ -479,15 +479,15 @@ class BatchedEnv:
         )
 
     def edges(self, graph: npt.NDArray[np.float32]) -> rules.Edges:
-        """The graph (B, N, N) of an observation as lists of edges, with each neighbour's relative position."""
+        """Return the graph (B, N, N) of an observation as lists of edges, with each neighbour's relative position."""
         return rules.communication_edges(graph, self._state.positions)
 
     def on_goal(self) -> npt.NDArray[np.bool_]:
-        """(B, N) which robots stand on their goals."""
+        """Return the robots (B, N) that stand on their goals."""
         return self._state.on_goal.copy()
 
     def action_mask(self) -> npt.NDArray[np.int8]:
-        """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle; absent robots may idle."""
+        """Return (B, N, 5), 1 for each action that stays on free cells; absent robots may idle."""
         self.stepper.write_action_masks()
         return self._state.action_mask.copy()
 

@@ -26,16 +26,16 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
 
     Every agent observes `{"fov": (C, F, F), "graph": (N,)}`: its field of view and its row of the communication graph;
     with `robot_features` also "scalars" (K,), with `edge_features` also "edge_attr" (N, D).
-    All agents live until the joint end: terminated once all are on their goals at the same time, truncated after
+    All agents act until the joint end: terminated once all are on their goals at the same time, truncated after
     `max_cycles` steps. Infos carry `action_mask` (5,), `replaced` (the shield changed the action) and `on_goal`, in
     lifelong tasks `arrived` too.
 
     Args:
         observation: "dict", or "box" for the field of view alone.
-        preferences: An action is a value for each of the five moves, (5,) float32, in place of one of them; this needs
+        preferences: An action is a score for each of the five moves, (5,) float32, instead of one of them; this needs
             shield="pibt".
-        reuse_buffers: Return the same dictionaries and arrays at every step, overwritten; faster, for loops that keep
-            nothing.
+        reuse_buffers: Return the same dictionaries and arrays at every step, overwritten; faster, for loops that store
+            none of them.
         render_mode: "ansi" gives text, "rgb_array" a picture (H', W', 3), "human" prints the text at each step; in a
             terminal each state replaces the one before, `metadata["render_fps"]` times a second.
         cases: As in `BatchedEnv`.
@@ -91,18 +91,18 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         return self.__dict__ | {"_reused": None}  # its dictionaries share the memory of its arrays
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The space of an agent's observation; the same object at every call.
+        """Return the observation space of an agent; the same object at every call.
 
         Raises:
-            ValueError: If there is no such agent.
+            ValueError: If the agent is unknown.
         """
         return _space_of(agent, self.observation_spaces)
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The five moves: up, left, down, right, idle; with preferences a value for each.
+        """The five moves: up, left, down, right, idle; with preferences a score for each.
 
         Raises:
-            ValueError: If there is no such agent.
+            ValueError: If the agent is unknown.
         """
         return _space_of(agent, self.action_spaces)
 
@@ -122,13 +122,15 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         return self._batch.goals[0]
 
     def instance(self) -> Instance:
-        """The problem seen from here: the current positions are its starts."""
+        """The remaining problem: its starts are the current positions."""
         if not self.agents:
             raise RuntimeError("there is no episode: call reset() first")
         return Instance(self.grid, self.positions, self.goals)
 
     def state(self) -> npt.NDArray[np.float32]:
-        """(3, H, W) all there is: obstacles, robots and goals; robot i and its goal are drawn as (i + 1) / N.
+        """Return the global state (3, H, W): obstacles, robots and goals.
+
+        Robot i and its goal have the value (i + 1) / N.
 
         Raises:
             RuntimeError: Before the first reset.
@@ -184,7 +186,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         Raises:
             RuntimeError: Before the first reset or after the end of the episode.
             ValueError: If agents are missing or unknown, or an action is out of range.
-            TypeError: If `actions` is no dictionary, or an action is not an integer.
+            TypeError: If `actions` is not a dictionary, or an action is not an integer.
         """
         if not isinstance(actions, dict):
             raise TypeError(f"actions must be a dictionary of one action for each agent, got {type(actions).__name__}")
@@ -214,7 +216,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         return observations, rewards, terminated, truncated, infos
 
     def render(self) -> str | npt.NDArray[np.uint8] | None:
-        """The current state as `render_mode` has it; None without one and for "human".
+        """Render the current state in `render_mode`; returns None without a mode and for "human".
 
         Raises:
             RuntimeError: Before the first reset.
@@ -222,12 +224,12 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         return self._screen.show(self._batch)
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there is nothing to release."""
 
     def _fresh(self, buffers: Observation) -> tuple[dict[str, Any], dict[str, Any], Any]:
-        """Observations and infos by agent, whose arrays are rows of the buffers (1, N, ...) and of masks (N, 5).
+        """Return observations and infos by agent, whose arrays are rows of the buffers (1, N, ...) and of masks (N, 5).
 
-        And these as memory for the stepper, of its dtype.
+        The third part has the same arrays as memory for the stepper, in its dtype.
         """
         agents, rows = self.possible_agents, _native.rows_by_agent
         masks = np.empty(self._masks_shape, np.int8)
@@ -244,7 +246,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         )
 
     def _checked(self, actions: dict[str, Any]) -> list[Any]:
-        """The actions in the order of agents, or what is wrong with them."""
+        """Return the actions in the order of agents, or raise the error that says what is wrong with them."""
         if actions.keys() != set(self.agents):
             missing, unknown = set(self.agents) - actions.keys(), actions.keys() - set(self.agents)
             raise ValueError(f"give one action for each agent; missing: {sorted(missing)}, unknown: {sorted(unknown)}")
@@ -254,7 +256,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
 
 
 class _Reused:
-    """What a `GridEnv` returns at every step if it reuses its buffers: dictionaries whose arrays are rows of these."""
+    """The dictionaries that a `GridEnv` with reused buffers returns at every step; their arrays are rows of these."""
 
     def __init__(self, env: GridEnv) -> None:
         self.buffers = env._batch.buffers()
@@ -263,7 +265,7 @@ class _Reused:
 
 
 def observation_spaces(config: EnvConfig) -> dict[str, Any]:
-    """The values of what one robot observes, by key: fov (C, F, F), graph (N,), and scalars and edge_attr if any."""
+    """The observation of one robot by key: fov (C, F, F), graph (N,), and scalars and edge_attr if any."""
     low, high, unit = config.channel_low, config.channel_high, config.channel_unit
     if config.dtype == "uint8":
         low, high = np.zeros_like(low), (high - low) * unit
@@ -283,7 +285,7 @@ def observation_spaces(config: EnvConfig) -> dict[str, Any]:
 def begun(
     batch: BatchedEnv, config: EnvConfig, seed: int | None, instance: Instance | None, out: Observation | None = None
 ) -> BatchedEnv:
-    """A batch of one team at the beginning of an episode: `batch`, or its heir on maps of the instance's size.
+    """Return a batch of one team at the start of an episode: `batch`, or its successor on maps of the instance's size.
 
     Raises:
         ValueError: If the instance has another number of agents than the environment; `batch` is then as it was.
@@ -295,7 +297,7 @@ def begun(
 
 
 def instance_asked_for(options: dict[str, Any] | None) -> Instance | None:
-    """`options["instance"]` of a reset, if it is there; raises TypeError where it, or `options`, is something else."""
+    """Return `options["instance"]` of a reset, if given; raises TypeError if it or `options` has the wrong type."""
     instance = None if options is None else arguments.instance_of(options, dict, "options").get("instance")
     return None if instance is None else arguments.instance_of(instance, Instance, 'options["instance"]')
 
@@ -308,17 +310,17 @@ def _space_of(agent: str, found: dict[str, spaces.Space[Any]]) -> spaces.Space[A
 
 
 def _as_preferences(agent: str, action: Any) -> npt.NDArray[np.float32]:
-    values = arguments.numbers(action, f"the action of {agent}")
-    if values.shape != (5,):
-        raise ValueError(f"the action of {agent} must be a value for each of the five moves, got {action!r}")
-    return rules.as_values(values)
+    scores = arguments.numbers(action, f"the action of {agent}")
+    if scores.shape != (5,):
+        raise ValueError(f"the action of {agent} must be a score for each of the five moves, got {action!r}")
+    return rules.as_scores(scores)
 
 
 def parallel_env(**settings: Any) -> GridEnv:
-    """A `pettingzoo.ParallelEnv` of one team; the settings are those of `GridEnv`."""
+    """Make a `pettingzoo.ParallelEnv` of one team; the settings are those of `GridEnv`."""
     return GridEnv(**settings)
 
 
 def env(**settings: Any) -> pettingzoo.AECEnv[str, Any, Any]:
-    """The same environment in PettingZoo's turn-based (AEC) form."""
+    """Make the same environment in PettingZoo's turn-based (AEC) form."""
     return parallel_to_aec(parallel_env(**settings))

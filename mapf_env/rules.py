@@ -1,8 +1,8 @@
 """The rules of motion and perception: pure functions over batches of teams.
 
 B is the number of environments, N of robots in each, F = 2 * fov_radius + 3 the side of a view. Maps are passed as
-`bordered(grids, fov_radius)` makes them, so that a view never leaves the array. Every function checks shapes and raises
-ValueError, or TypeError where cells or actions are no integers.
+`bordered(grids, border)` makes them; a border of fov_radius cells keeps every view inside the array. Every function
+checks shapes and raises ValueError, or TypeError if cells or actions are not integers.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ def _cells(values: npt.ArrayLike, name: str = "positions") -> Positions:
     return arguments.cells(values, name, "(B, N, 2)")
 
 
-def bordered(grids: npt.NDArray[np.bool_], fov_radius: int, dtype: npt.DTypeLike = np.float32) -> Bordered:
-    """Grids (B, H, W) inside a border of `fov_radius` obstacles, as 0 and 1 of the dtype that views shall have."""
-    if fov_radius < 1:
-        raise ValueError(f"fov_radius must be at least 1, got {fov_radius}")
+def bordered(grids: npt.NDArray[np.bool_], border: int, dtype: npt.DTypeLike = np.float32) -> Bordered:
+    """Return grids (B, H, W) inside `border` cells of obstacles on each side, as 0 and 1 in the dtype of the views."""
+    if border < 1:
+        raise ValueError(f"border must be at least 1, got {border}")
     if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.uint8)):
         raise ValueError(f"views are float32 or uint8, got {np.dtype(dtype)}")
-    border = ((0, 0), (fov_radius, fov_radius), (fov_radius, fov_radius))
-    return np.pad(grids.astype(dtype), border, constant_values=1)
+    width = ((0, 0), (border, border), (border, border))
+    return np.pad(grids.astype(dtype), width, constant_values=1)
 
 
 def observe(
@@ -43,12 +43,12 @@ def observe(
     fov_radius: int,
     out: npt.NDArray[Any] | None = None,
 ) -> npt.NDArray[Any]:
-    """Every robot's field of view, (B, N, 3, F, F), in the layout of the paper's released code.
+    """Return every robot's field of view, (B, N, 3, F, F), in the layout of the authors' code.
 
     The inner window of 2 * fov_radius + 1 cells a side is the view, centred on the robot; the one-cell ring around it
     carries only the goal when that is out of sight, projected along the line from the robot to it. Channels: obstacles
-    (cells outside the map count), the own goal (exactly one cell), all robots in view, itself included.
-    Source: Li et al. 2020, r_FOV = 4 gives 3 x 11 x 11; the layout is that of the authors' released code.
+    (cells outside the map count), the robot's own goal (exactly one cell), all robots in view, itself included.
+    Source: Li et al. 2020, r_FOV = 4 gives 3 x 11 x 11; the layout is that of the authors' code.
     """
     positions, goals = _cells(positions), _cells(goals, "goals")
     if out is None:
@@ -59,7 +59,7 @@ def observe(
 
 
 def distances(grid: npt.ArrayLike, cells: npt.ArrayLike) -> npt.NDArray[np.int32]:
-    """Steps from each cell of a map (H, W) to each of M cells (M, 2), as (M, H, W); -1 where there is no way.
+    """Return the steps from each cell of a map (H, W) to each of M cells (M, 2), as (M, H, W); -1 if unreachable.
 
     Raises:
         ValueError: If a shape is wrong or a cell lies off the map.
@@ -68,9 +68,9 @@ def distances(grid: npt.ArrayLike, cells: npt.ArrayLike) -> npt.NDArray[np.int32
     return _native.distances(as_obstacles(grid), arguments.cells(cells, "cells", "(M, 2)"))
 
 
-def distance_tables(obstacles: Bordered, fov_radius: int, goals: npt.ArrayLike) -> npt.NDArray[np.uint16]:
-    """Steps from each cell of the bordered maps to each goal, (B, N, size); 65535 where there is no way."""
-    return _native.distance_tables(obstacles, fov_radius, _cells(goals, "goals"))
+def distance_tables(obstacles: Bordered, border: int, goals: npt.ArrayLike) -> npt.NDArray[np.uint16]:
+    """Return the steps from each cell of the bordered maps to each goal, (B, N, size); 65535 if unreachable."""
+    return _native.distance_tables(obstacles, border, _cells(goals, "goals"))
 
 
 def communication_graph(
@@ -80,10 +80,11 @@ def communication_graph(
     *,
     weights: CommWeights = "binary",
 ) -> npt.NDArray[np.float32]:
-    """Who hears whom: weights (B, N, N), or (N, N) for positions (N, 2); `radius` is one number or one for each team.
+    """Return link weights (B, N, N), or (N, N) for positions (N, 2); `radius` is one number or one for each team.
 
-    1, or with `weights="distance"` 1 / distance, where two different robots are closer than `radius` cells (Euclidean,
-    strictly, as in the released code), else 0. `out` is memory (B, N, N) to write them into, for positions (B, N, 2).
+    Two different robots closer than `radius` cells (Euclidean, strictly, as in the authors' code) hear each other:
+    their weight is 1, or with `weights="distance"` 1 / distance; all others are 0. `out` is memory (B, N, N) to write
+    them into, for positions (B, N, 2).
     """
     arguments.choice(weights, get_args(CommWeights), "weights")
     found = arguments.array(positions, "positions")
@@ -105,9 +106,9 @@ def communication_graph(
 
 
 def connecting_radius(positions: npt.ArrayLike, radius: float) -> float:
-    """The least radius * 1.1^k, k = 0, 1, ..., at which robots at `positions` (N, 2) all reach each other over others.
+    """Return the least radius * 1.1^k, k = 0, 1, ..., that connects all robots at `positions` (N, 2).
 
-    Source: the released code of Li et al. 2020, which grows the radius so at the beginning of each case and keeps it.
+    Source: the code of Li et al. 2020, which grows the radius in this way at the start of each case and then keeps it.
     """
     return _native.connecting_radius(arguments.cells(positions, "positions", "(N, 2)"), radius)
 
@@ -115,9 +116,10 @@ def connecting_radius(positions: npt.ArrayLike, radius: float) -> float:
 def lose_messages(
     graph: npt.NDArray[np.float32], loss: float, seeds: npt.NDArray[np.uint64], times: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.float32]:
-    """The graph (B, N, N) of which each edge, in each direction for itself, fails with probability `loss`.
+    """Return the graph (B, N, N) without the edges that fail.
 
-    The draw depends on the environment's seed and time, both (B,), and the two robots alone.
+    Each direction of an edge fails independently with probability `loss`.
+    The draw depends only on the environment's seed and time, both (B,), and the two robots.
     """
     heard = np.array(graph, np.float32, order="C")
     _native.lose_messages(heard, loss, seeds, times)
@@ -128,11 +130,11 @@ class Edges(NamedTuple):
     """The communication graphs of B teams as lists of E edges, for networks that pass messages along edges."""
 
     team: npt.NDArray[np.intp]
-    """(E,) which environment, ascending."""
+    """(E,) the environment, ascending."""
     receiver: npt.NDArray[np.intp]
-    """(E,) who hears, 0..N-1."""
+    """(E,) the robot that hears, 0..N-1."""
     sender: npt.NDArray[np.intp]
-    """(E,) who is heard."""
+    """(E,) the robot that is heard."""
     weight: npt.NDArray[np.float32]
     """(E,)"""
     offset: npt.NDArray[np.int32]
@@ -140,11 +142,11 @@ class Edges(NamedTuple):
 
 
 def communication_edges(graph: npt.ArrayLike, positions: npt.ArrayLike) -> Edges:
-    """The edges of dense graphs (B, N, N) between robots at `positions` (B, N, 2).
+    """Return the edges of dense graphs (B, N, N) between robots at `positions` (B, N, 2).
 
     Raises:
         ValueError: If the shapes do not fit.
-        TypeError: If positions are no integers or weights no numbers.
+        TypeError: If positions are not integers or weights are not numbers.
     """
     graph, positions = (
         arguments.shaped(graph, "graph", "(B, N, N)"),
@@ -161,25 +163,25 @@ def communication_edges(graph: npt.ArrayLike, positions: npt.ArrayLike) -> Edges
 
 def shield(
     obstacles: Bordered,
-    fov_radius: int,
+    border: int,
     positions: npt.ArrayLike,
     actions: npt.ArrayLike,
     seeds: npt.NDArray[np.uint64],
     times: npt.NDArray[np.int64],
 ) -> npt.NDArray[np.int8]:
-    """The actions (B, N) that the paper's collision shield lets through; the others become idle.
+    """Return the actions (B, N) that the paper's collision shield lets through; the others become idle.
 
     A move off the map, into an obstacle or into the cell of a robot that stays, and both moves of a swap become idle;
     of several robots that enter one cell, one goes, drawn by the environment's seed and time, both (B,). The rules are
     applied to their fixed point: what is returned never collides, and a joint action without conflicts is unchanged.
     Source: Li et al. 2020, section 2 (collision shielding).
     """
-    return _native.shield(obstacles, fov_radius, _cells(positions), as_actions(actions), seeds, times)
+    return _native.shield(obstacles, border, _cells(positions), as_actions(actions), seeds, times)
 
 
 def pibt_shield(
     obstacles: Bordered,
-    fov_radius: int,
+    border: int,
     positions: npt.ArrayLike,
     wanted: npt.ArrayLike,
     under_way: npt.NDArray[np.int32],
@@ -189,12 +191,12 @@ def pibt_shield(
     goals: npt.ArrayLike | None = None,
     distances: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.int8]:
-    """The actions (B, N) of one step of priority inheritance with backtracking; they never collide.
+    """Return the actions (B, N) of one step of priority inheritance with backtracking; they never collide.
 
-    `wanted` is a value for each action, (B, N, 5), of which the greatest is wanted most (equal ones in the actions'
-    order), or one action of each robot, (B, N), which stands for the order: that action, idle, the others by lot, drawn
-    by the environment's seed and time. Robots choose in the order of `under_way` (B, N), the longest under way first,
-    equal ones in an order drawn by the seed; a robot in the way of a more important one moves aside if it can.
+    `wanted` is a score for each action, (B, N, 5), of which the greatest is preferred (ties in the actions' order). Or
+    it is one action for each robot, (B, N), which stands for this order: that action, idle, then the others in an order
+    drawn from the environment's seed and time. Robots choose in the order of `under_way` (B, N), the longest under way
+    first, ties in an order drawn from the seed; a robot in the way of one with higher priority moves aside if it can.
     Source: Okumura, Machida, Defago and Tamura 2022.
 
     With `goals` (B, N, 2) and their `distances` of `distance_tables`, two robots that face each other in a corridor
@@ -208,45 +210,45 @@ def pibt_shield(
         raise ValueError("swaps need both goals and distances (see rules.distance_tables): give both or neither")
     array = arguments.numbers(wanted, "wanted")
     if array.ndim == 3:
-        values, actions = as_values(array), np.zeros((0, 0), np.int64)
+        scores, actions = as_scores(array), np.zeros((0, 0), np.int64)
     else:
-        values, actions = np.zeros((0, 0, 0), np.float32), as_actions(array)
+        scores, actions = np.zeros((0, 0, 0), np.float32), as_actions(array)
     there = None if goals is None else _cells(goals, "goals")
     return _native.pibt_shield(
-        obstacles, fov_radius, _cells(positions), values, actions, under_way, seeds, times, there, distances
+        obstacles, border, _cells(positions), scores, actions, under_way, seeds, times, there, distances
     )
 
 
 def draw_goals(
     obstacles: Bordered,
-    fov_radius: int,
+    border: int,
     positions: npt.ArrayLike,
     goals: npt.ArrayLike,
     on_goal: npt.NDArray[np.bool_],
     arrivals: npt.NDArray[np.int32],
     seeds: npt.NDArray[np.uint64],
 ) -> Positions:
-    """Goals (B, N, 2) in which the robots that are `on_goal` (B, N) have new ones.
+    """Return goals (B, N, 2) with new ones for the robots that are `on_goal` (B, N).
 
-    A new goal is uniform over the free cells that the robot can reach, that are no robot's goal and where it does not
-    stand; if there is none, it keeps its goal. The draw depends on the environment's seed, the robot and the number of
+    A new goal is uniform over the free cells that the robot can reach, except for all robots' goals and its own cell;
+    if there is none, it keeps its goal. The draw depends on the environment's seed, the robot and the number of
     its `arrivals` (B, N).
     """
     drawn = _cells(goals, "goals")
-    _native.draw_goals(obstacles, fov_radius, _cells(positions), drawn, arrivals, on_goal, seeds)
+    _native.draw_goals(obstacles, border, _cells(positions), drawn, arrivals, on_goal, seeds)
     return drawn
 
 
-def as_values(values: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """`values` of all five actions as contiguous float32; raises TypeError if they are not numbers."""
-    array = arguments.numbers(values, "values of actions")
+def as_scores(scores: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Return `scores` of all five actions as contiguous float32; raises TypeError if they are not numbers."""
+    array = arguments.numbers(scores, "scores of actions")
     if array.dtype.kind not in "fiu":
-        raise TypeError(f"values of actions must be numbers, got dtype {array.dtype}")
+        raise TypeError(f"scores of actions must be numbers, got dtype {array.dtype}")
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
 def as_actions(actions: npt.ArrayLike) -> npt.NDArray[np.int64]:
-    """`actions` as int64; raises TypeError if they are not integers."""
+    """Return `actions` as int64; raises TypeError if they are not integers."""
     array = arguments.numbers(actions, "actions")
     if array.dtype.kind not in "iu":
         raise TypeError(f"actions must be integers 0..4 (up, left, down, right, idle), got dtype {array.dtype}")
@@ -256,10 +258,10 @@ def as_actions(actions: npt.ArrayLike) -> npt.NDArray[np.int64]:
 
 
 def move(positions: npt.ArrayLike, actions: npt.ArrayLike) -> Positions:
-    """Positions (B, N, 2) after the shielded actions (B, N)."""
+    """Return the positions (B, N, 2) after the shielded actions (B, N)."""
     return _native.move(_cells(positions), as_actions(actions))
 
 
-def action_mask(obstacles: Bordered, fov_radius: int, positions: npt.ArrayLike) -> npt.NDArray[np.int8]:
-    """(B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle."""
-    return _native.action_mask(obstacles, fov_radius, _cells(positions))
+def action_mask(obstacles: Bordered, border: int, positions: npt.ArrayLike) -> npt.NDArray[np.int8]:
+    """Return (B, N, 5), 1 for each action that neither leaves the map nor enters an obstacle."""
+    return _native.action_mask(obstacles, border, _cells(positions))

@@ -18,11 +18,11 @@
 #include "experts/native/ecbs.hpp"
 #include "experts/native/improvement.hpp"
 #include "experts/native/labels.hpp"
-#include "experts/native/lacam.hpp"
+#include "experts/native/lazy_constraints.hpp"
 #include "experts/native/neighbourhood_search.hpp"
-#include "experts/native/pibt.hpp"
-#include "experts/native/prioritised.hpp"
-#include "experts/native/relabel.hpp"
+#include "experts/native/priority_inheritance.hpp"
+#include "experts/native/prioritised_planning.hpp"
+#include "experts/native/relabelling.hpp"
 #include "experts/native/rolling_horizon.hpp"
 #include "experts/native/work_queue.hpp"
 #include "mapf_env/native/arrays.hpp"
@@ -39,7 +39,7 @@ using GridArray = In<bool, 2>;
 using CellsArray = In<std::int32_t, 2>;
 using InstanceArrays = std::tuple<GridArray, CellsArray, CellsArray>;
 
-// What Python's Result is made of: status, paths, cost, lower bound, expansions, generated, seconds, found by.
+// The parts of Python's Result: status, paths, cost, lower bound, expansions, generated, seconds, found by.
 using ResultParts = std::tuple<int, std::optional<Out<std::int32_t>>, std::int64_t, std::int64_t, std::size_t,
                                std::size_t, double, int>;
 
@@ -192,7 +192,7 @@ std::pair<Out<std::int8_t>, Out<bool>> relabel(const std::vector<std::pair<GridA
     return {actions_array, solved_array};
 }
 
-// What Python's PlanLabels is made of: source, time, offsets, positions, actions, solved, cost, found by.
+// The parts of Python's PlanLabels: source, time, offsets, positions, actions, solved, cost, found by.
 using LabelParts = std::tuple<Out<std::int64_t>, Out<std::int32_t>, Out<std::int64_t>, Out<std::int32_t>,
                               Out<std::int8_t>, Out<bool>, Out<std::int64_t>, std::vector<int>>;
 

@@ -1,4 +1,4 @@
-// What a search may spend: a deadline, and a request to stop that may come from outside at any moment.
+// The budget of a search: a deadline, and a request to stop that may come from outside at any moment.
 #pragma once
 
 #include <atomic>
@@ -10,7 +10,7 @@ namespace mapf {
 
 using Clock = std::chrono::steady_clock;
 
-// A request to stop all searches of one call. Only the thread that made the call polls the outside world for it.
+// A request to stop all searches of one call. Only the thread that made the call polls for it.
 class Interrupt {
 public:
     explicit Interrupt(std::function<bool()> outside) : outside_(std::move(outside)) {}
@@ -18,7 +18,7 @@ public:
     bool requested() const { return requested_.load(std::memory_order_relaxed); }
     void request() { requested_.store(true, std::memory_order_relaxed); }
 
-    // Asks the outside world whether to stop, at most once in an interval.
+    // Polls for a request to stop, at most once in an interval.
     void poll(Clock::time_point now) {
         if (now < next_poll_) return;
         next_poll_ = now + interval;
@@ -43,13 +43,13 @@ public:
             deadline_ = begin_ + std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(seconds));
     }
 
-    // Whether to stop; looks at the clock on every 256th question only.
+    // Returns true if the search has to stop; reads the clock on every 256th call only.
     bool spent() {
         if (++questions_ % 256 == 0) look();
         return spent_;
     }
 
-    // Whether to stop, by a look at the clock now.
+    // Returns true if the search has to stop; reads the clock.
     bool look() {
         const auto now = Clock::now();
         if (polls_) interrupt_.poll(now);

@@ -7,8 +7,8 @@
 
 namespace mapf {
 
-// Whether some connected region is a simple path of cells on which the order of the robots' goals is not the order of
-// the robots. Exactly these are the regions on which a pair of robots alone is without a solution.
+// Returns true if some connected region is a simple path of cells on which the goals are in another order than the
+// robots. Exactly on these regions a pair of robots alone has no solution.
 bool order_forbids_solution(const Grid& grid, std::span<const int> starts, std::span<const int> goals);
 
 }  // namespace mapf

@@ -7,8 +7,8 @@ namespace mapf {
 
 namespace {
 
-constexpr int short_tries = 3;  // lengths to try before looking for the first that is possible
-constexpr int longest_recursion = 5'000;  // a step deeper at each time; longer paths are not compared
+constexpr int lengths_to_try = 3;  // lengths to try before looking for the first that is possible
+constexpr int longest_recursion = 5'000;  // one level per step; longer paths are not compared
 constexpr std::size_t most_joint_states = 20'000;
 
 }  // namespace
@@ -33,7 +33,7 @@ void DiagramBuilder::build(const Grid& grid, int start, int goal, const Distance
     }
     // Try the shortest lengths one by one; then flood forward for the first arrival that is possible.
     diagram.length = -1;
-    const int last_try = std::min(constraints.latest, shortest + short_tries);
+    const int last_try = std::min(constraints.latest, shortest + lengths_to_try);
     int length = shortest;
     while (length <= last_try && !try_length(start, length, diagram, budget)) ++length;
     if (length > last_try && last_try < constraints.latest) {
@@ -43,29 +43,30 @@ void DiagramBuilder::build(const Grid& grid, int start, int goal, const Distance
     for (const auto& closed : constraints.closed_cells) closed_from_[closed.cell] = forever;
 }
 
-// The first time in earliest..latest at which a robot can arrive, or forever.
+// Returns the first time in earliest..latest at which the robot can arrive, or `forever`.
 int DiagramBuilder::first_arrival(int start, int goal, int earliest, int latest, int last_constraint, Budget& budget) {
-    here_.assign(1, start);
-    since_.assign(closed_from_.size(), -1);
-    for (int time = 1; time <= latest && !here_.empty(); ++time) {
+    frontier_.assign(1, start);
+    reached_at_.assign(closed_from_.size(), -1);
+    for (int time = 1; time <= latest && !frontier_.empty(); ++time) {
         bool arrives = false;
-        after_.clear();
-        for (const int cell : here_) {
+        next_frontier_.clear();
+        for (const int cell : frontier_) {
             if (budget.spent()) return forever;
             for (int action = 0; action < num_actions; ++action) {
                 const int next = cell + steps_[action];
                 if (distance_[next] == unreachable || time >= closed_from_[next]) continue;
                 if (banned_.at(next, time) >> action & 1) continue;
                 arrives |= next == goal && action != idle;
-                if (since_[next] == time) continue;
-                since_[next] = time;
-                after_.push_back(next);
+                if (reached_at_[next] == time) continue;
+                reached_at_[next] = time;
+                next_frontier_.push_back(next);
             }
         }
         if (arrives && time >= earliest) return time;
-        // Once no rule changes any more, cells are only won; the robot has to leave its goal to come back, too.
-        if (time > std::max(last_constraint, earliest) + 2 && after_.size() == here_.size()) break;
-        std::swap(here_, after_);
+        // After the last constraint the set of reached cells only grows: if it does not, no later arrival is possible.
+        // Two more steps let the robot leave its goal and come back.
+        if (time > std::max(last_constraint, earliest) + 2 && next_frontier_.size() == frontier_.size()) break;
+        std::swap(frontier_, next_frontier_);
     }
     return forever;
 }
@@ -86,7 +87,7 @@ bool DiagramBuilder::try_length(int start, int length, DecisionDiagram& diagram,
                 const int next = cell + steps_[action];
                 if (distance_[next] == unreachable || time + distance_[next] > length) continue;
                 if (time >= closed_from_[next]) continue;
-                if (time == length && action == idle) continue;  // it would have arrived before
+                if (time == length && action == idle) continue;  // the path would be shorter
                 if (banned_.at(next, time) >> action & 1) continue;
                 int& index = index_of_[next];
                 if (index < end || index >= static_cast<int>(diagram.nodes.size()) ||
@@ -100,13 +101,13 @@ bool DiagramBuilder::try_length(int start, int length, DecisionDiagram& diagram,
         diagram.level.push_back(static_cast<int>(diagram.nodes.size()));
         if (diagram.level[time + 1] == diagram.level[time]) return false;
     }
-    // Backward: nodes without a way on are dropped.
+    // Backward: remove the nodes without a successor.
     diagram.length = length;
     prune(diagram);
     return true;
 }
 
-// Drops the nodes that lead nowhere.
+// Removes the nodes from which the last level cannot be reached, and renumbers the others.
 void DiagramBuilder::prune(DecisionDiagram& diagram) {
     auto& nodes = diagram.nodes;
     new_index_.assign(nodes.size(), 0);
@@ -171,14 +172,14 @@ bool JointSearch::compatible(const DecisionDiagram& first, const DecisionDiagram
     second_ = &second;
     if (first.length > second.length) std::swap(first_, second_);
     if (second_->length > longest_recursion) return true;
-    dead_.clear();
+    failed_.clear();
     return search(0, 0, 0);
 }
 
-// Whether the robots can go on from nodes i and j at `time`.
+// Returns true if the robots can complete compatible paths from nodes i and j at `time`.
 bool JointSearch::search(int time, int i, int j) {
     if (time == second_->length) return true;
-    if (dead_.size() > most_joint_states) return true;
+    if (failed_.size() > most_joint_states) return true;
     const auto& b = second_->nodes[j];
     const bool rests = time >= first_->length;
     const auto& a = first_->nodes[i];
@@ -187,18 +188,18 @@ bool JointSearch::search(int time, int i, int j) {
         if (next_j < 0) continue;
         const int cell_j = second_->nodes[next_j].cell;
         if (rests) {
-            if (cell_j == a.cell || dead_.at(i, next_j)) continue;
+            if (cell_j == a.cell || failed_.at(i, next_j)) continue;
             if (search(time + 1, i, next_j)) return true;
             continue;
         }
         for (const int next_i : a.next) {
             if (next_i < 0) continue;
             const int cell_i = first_->nodes[next_i].cell;
-            if (cell_i == cell_j || (cell_i == b.cell && cell_j == a.cell) || dead_.at(next_i, next_j)) continue;
+            if (cell_i == cell_j || (cell_i == b.cell && cell_j == a.cell) || failed_.at(next_i, next_j)) continue;
             if (search(time + 1, next_i, next_j)) return true;
         }
     }
-    dead_(i, j) = 1;
+    failed_(i, j) = 1;
     return false;
 }
 

@@ -21,8 +21,8 @@ constexpr std::size_t few_expansions_optimal = 8;  // and for w = 1
 constexpr int few_conflicts = 20;                  // with more of them in the root, other means are tried at once
 constexpr int many_conflicts = 60;                 // with more of them the root is not untangled
 constexpr int first_effort = 64;                   // rounds and nodes of the first turn; later turns have twice as many
-constexpr std::size_t first_lacam_turn = 4096;     // expansions of LaCAM's first turn
-constexpr std::size_t lacam_growth = 8;            // the next turn has so many times more
+constexpr std::size_t first_lacam_expansions = 4096;  // of LaCAM's first turn
+constexpr std::size_t lacam_growth = 8;               // factor from one turn to the next
 
 }  // namespace
 
@@ -91,15 +91,15 @@ bool Ecbs::plan_root(double w, std::uint64_t seed, Budget& budget) {
     const bool crowded = w > 1 && root.conflicts > many_conflicts;  // left to the neighbourhood search
     for (int before = root.conflicts + 1; !crowded && 0 < root.conflicts && root.conflicts < before;) {
         before = root.conflicts;
-        if (!untangle(root, budget)) return false;
+        if (!replan_root(root, budget)) return false;
     }
     root_paths_ = loaded_;
     nodes_.push_back(root);
     return true;
 }
 
-// What a search of a few nodes did not solve: large neighbourhood search for a plan, from node `id` or from LaCAM's plan,
-// and best-first search for a bound that proves it good enough, in turns.
+// Solves what a search of a few nodes did not: large neighbourhood search for a plan (from node `id` or from LaCAM's
+// plan) takes turns with best-first search for a bound that proves the plan good enough.
 Status Ecbs::solve_hard_case(int id, const EcbsOptions& options, Budget& budget) {
     if (order_forbids_solution(problem_->grid, problem_->starts, problem_->goals)) return Status::infeasible;
     if (!hard_) hard_ = std::make_unique<HardCases>();
@@ -116,19 +116,20 @@ Status Ecbs::solve_hard_case(int id, const EcbsOptions& options, Budget& budget)
     const auto nodes_left = [&] {
         return options.node_limit - std::min(options.node_limit, nodes_.size() + (proves_ ? proving.generated() : 0));
     };
-    auto lacam_turn = first_lacam_turn;
+    auto lacam_turn = first_lacam_expansions;
     for (int effort = first_effort;; effort += effort, lacam_turn *= lacam_growth) {
         std::int64_t known = std::numeric_limits<std::int64_t>::max();
         if (!needs_optimum) {
-            // Repair: the plan of the neighbourhoods loses its conflicts, then costs.
+            // Repair: neighbourhood search removes the plan's conflicts, then reduces its cost.
             const auto target = cost_limit(options.w, lower_bound_);
             if (neighbourhoods.run(target, effort, budget))
                 return finish(hard_->plan_of_neighbourhoods, neighbourhoods.cost());
             // Complete search: LaCAM's plan is the incumbent if it is the cheapest so far.
-            if (const auto ended = ask_lacam(hard_->lacam_expansions() + lacam_turn, options, budget)) return *ended;
+            const auto most = hard_->lacam_expansions() + lacam_turn;
+            if (const auto ended = continue_lacam(most, options, budget)) return *ended;
             if (neighbourhoods.feasible()) known = neighbourhoods.cost();
         }
-        // Proof: the bound rises. The larger w is, the less that helps.
+        // Proof: raise the lower bound. The larger w is, the less that helps.
         if (!proves_) {
             load(0);
             proving.begin(*problem_, path_of);
@@ -146,13 +147,14 @@ Status Ecbs::solve_hard_case(int id, const EcbsOptions& options, Budget& budget)
         if (budget.look()) return Status::time_limit;
         if (nodes_left() > 0) continue;
         if (needs_optimum) return Status::node_limit;
-        return ask_lacam(Lacam::limits_of(options.node_limit).expansions, options, budget).value_or(Status::node_limit);
+        const auto most = Lacam::limits_of(options.node_limit).expansions;
+        return continue_lacam(most, options, budget).value_or(Status::node_limit);
     }
 }
 
-// Goes on with LaCAM, up to `expansions` in all, if it has no plan yet. Its first plan is returned if that is good
-// enough; if it is cheaper than the plan of the neighbourhood search, that goes on from it.
-std::optional<Status> Ecbs::ask_lacam(std::size_t expansions, const EcbsOptions& options, Budget& budget) {
+// Continues LaCAM, up to `expansions` in all, unless it has a plan. Its plan ends the search if it is good enough; if it
+// is cheaper than the plan of the neighbourhood search, that continues from it.
+std::optional<Status> Ecbs::continue_lacam(std::size_t expansions, const EcbsOptions& options, Budget& budget) {
     auto& [neighbourhoods, proving, lacam, plan, plan_of_neighbourhoods] = *hard_;
     if (!lacam) {
         lacam.emplace(problem_->grid, problem_->starts, problem_->goals, options.seed);
@@ -175,20 +177,20 @@ std::optional<Status> Ecbs::ask_lacam(std::size_t expansions, const EcbsOptions&
     return std::nullopt;
 }
 
-Status Ecbs::finish(FoundBy author, std::int64_t cost) {
-    found_by_ = author;
+Status Ecbs::finish(FoundBy solver, std::int64_t cost) {
+    found_by_ = solver;
     cost_ = static_cast<int>(cost);
     return Status::solved;
 }
 
-// Ends with the cheapest plan of all searches, if there is one. It can be within the bound after all: limits may cut a
-// search off between the last plan or bound and the next comparison of the two.
+// Ends with the cheapest plan of all searches, if there is one. That plan can be within the bound: a limit may cut a
+// search off after its last plan or bound was found and before the two were compared.
 Status Ecbs::end_at(Status limit, double w) {
     auto best = std::numeric_limits<std::int64_t>::max();
-    const auto consider = [&](FoundBy author, std::int64_t cost) {
+    const auto consider = [&](FoundBy solver, std::int64_t cost) {
         if (cost >= best) return;
         best = cost;
-        finish(author, cost);
+        finish(solver, cost);
     };
     if (best_node_ != none) consider(FoundBy::ecbs, nodes_[best_node_].cost);
     if (repairs_ && hard_->neighbourhoods.feasible())
@@ -198,8 +200,8 @@ Status Ecbs::end_at(Status limit, double w) {
     return has_plan() && best <= cost_limit(w, lower_bound_) ? Status::solved : limit;
 }
 
-// Plans each robot in conflict anew, now that it can see the paths of all; no path becomes longer.
-bool Ecbs::untangle(Node& root, Budget& budget) {
+// Replans each robot in conflict around the paths of all others; no path becomes longer.
+bool Ecbs::replan_root(Node& root, Budget& budget) {
     for (const int robot : order_) {
         const auto old_path = view(robot, loaded_[robot]);
         const int conflicts = traffic_.conflicts(old_path) - old_path.arrival();  // it meets itself at every step
@@ -241,7 +243,7 @@ void Ecbs::open(const Node& node) {
     open_.push(id, node.cost, node.conflicts);
 }
 
-// Makes the traffic that of node `id`, changing only the paths that differ.
+// Loads the paths of node `id` into the traffic; paths that stay the same are not touched.
 void Ecbs::load(int id) {
     if (traffic_.is_sparse()) {
         traffic_.reset(problem_->grid.layout);
@@ -259,7 +261,7 @@ void Ecbs::load(int id) {
     }
 }
 
-// The earliest conflict of the loaded paths, of which there is at least one.
+// Returns the earliest conflict of the loaded paths, which have at least one.
 Ecbs::Conflict Ecbs::first_conflict() {
     const auto steps = problem_->grid.layout.steps();
     cells_.assign(problem_->starts.begin(), problem_->starts.end());
@@ -290,7 +292,7 @@ Ecbs::Conflict Ecbs::first_conflict() {
     throw std::logic_error("conflicts were counted, but the paths have none: please report this as a bug of experts");
 }
 
-// The child of the loaded node `id` that obeys one more constraint, if its robot has a path.
+// Returns the child of the loaded node `id` with one more constraint, if its robot has a path.
 std::optional<Ecbs::Node> Ecbs::replan(int id, const Constraint& constraint, Budget& budget) {
     const int robot = constraint.robot;
     const int goal = problem_->goals[robot];

@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "experts/native/budget.hpp"
-#include "experts/native/lacam.hpp"
+#include "experts/native/lazy_constraints.hpp"
 #include "experts/native/neighbourhood_search.hpp"
 #include "experts/native/open_list.hpp"
 #include "experts/native/problem.hpp"
@@ -40,7 +40,7 @@ public:
     // lower bound then: has_plan() holds for it, too.
     Status solve(const Problem& problem, const EcbsOptions& options, Budget& budget);
 
-    // Of the last search. Each robot's actions until it arrives, if there is a plan.
+    // The plan of the last search, if any: each robot's actions until it arrives.
     std::span<const std::uint8_t> actions(std::size_t robot) const {
         switch (found_by_) {
             case FoundBy::proof: return hard_->proving.actions(robot);
@@ -95,10 +95,10 @@ private:
 
     Status search(const EcbsOptions& options, Budget& budget);
     bool plan_root(double w, std::uint64_t seed, Budget& budget);
-    bool untangle(Node& root, Budget& budget);
+    bool replan_root(Node& root, Budget& budget);
     Status solve_hard_case(int id, const EcbsOptions& options, Budget& budget);
-    std::optional<Status> ask_lacam(std::size_t expansions, const EcbsOptions& options, Budget& budget);
-    Status finish(FoundBy author, std::int64_t cost);
+    std::optional<Status> continue_lacam(std::size_t expansions, const EcbsOptions& options, Budget& budget);
+    Status finish(FoundBy solver, std::int64_t cost);
     Status end_at(Status limit, double w);
     Journey journey(int robot, int earliest) const;
     void expand(int id, Budget& budget);

@@ -4,7 +4,7 @@
 #include <cstdint>
 
 #include "experts/native/budget.hpp"
-#include "experts/native/lacam.hpp"
+#include "experts/native/lazy_constraints.hpp"
 #include "experts/native/neighbourhood_search.hpp"
 #include "experts/native/problem.hpp"
 

@@ -5,7 +5,7 @@
 
 #include "experts/native/ecbs.hpp"
 #include "experts/native/improvement.hpp"
-#include "experts/native/lacam.hpp"
+#include "experts/native/lazy_constraints.hpp"
 #include "experts/native/work_queue.hpp"
 
 namespace mapf {

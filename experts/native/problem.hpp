@@ -1,4 +1,4 @@
-// What every solver is given, and how a search can end.
+// The input of every solver, and the possible ends of a search.
 #pragma once
 
 #include <cmath>

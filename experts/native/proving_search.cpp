@@ -20,10 +20,10 @@ void ProvingSearch::reset(const Problem& problem) {
     num_robots_ = problem.starts.size();
     nodes_.clear();
     changes_.clear();
-    tracks_.clear();
+    paths_.clear();
     actions_.clear();
     open_.clear();
-    root_tracks_.assign(num_robots_, none);
+    root_paths_.assign(num_robots_, none);
     loaded_.assign(num_robots_, none);
     best_ = none;
     lower_bound_ = 0;
@@ -40,15 +40,15 @@ void ProvingSearch::reset(const Problem& problem) {
 void ProvingSearch::open_root() {
     Node root{none, 0, 0, 0, false, {}, 0, 0};
     for (std::size_t robot = 0; robot < num_robots_; ++robot) {
-        const auto path = view(root_tracks_[robot]);
+        const auto path = view(root_paths_[robot]);
         root.cost += path.arrival();
         root.conflicts += traffic_.conflicts(path);
         traffic_.add(path);
-        loaded_[robot] = root_tracks_[robot];
+        loaded_[robot] = root_paths_[robot];
     }
     root.bound = root.cost;
     nodes_.push_back(root);
-    keep(0);
+    insert(0);
 }
 
 ProvingSearch::Outcome ProvingSearch::run(double w, std::int64_t known, std::size_t nodes, Budget& budget) {
@@ -57,22 +57,23 @@ ProvingSearch::Outcome ProvingSearch::run(double w, std::int64_t known, std::siz
         return known <= limit || (has_plan() && cost() <= limit);
     };
     while (!open_.empty()) {
-        // Best first: the lowest bound of an open node is a bound on the optimum.
+        // 1. Best first: the lowest f in OPEN is a lower bound on the optimum.
         lower_bound_ = std::max<std::int64_t>(lower_bound_, open_.front().bound);
         if (proved()) return Outcome::proved;
         if (nodes_.size() >= nodes || budget.look()) return Outcome::paused;
         const int id = pop();
         load(id);
+        // 2. Conflicts: the first of each pair.
         find_conflicts();
-        // DG heuristic: a node is weighed when it is taken, and goes back where that raises its bound.
+        // 3. DG heuristic, computed when a node is first taken: if it raises f, the node goes back into OPEN.
         if (!nodes_[id].has_heuristic && compute_heuristic(id, budget)) {
             push(id);
             continue;
         }
-        // Split: every plan below the node is below one of its children.
+        // 4. Split: every plan that obeys the node's constraints obeys those of one child.
         ++expansions_;
         expand(id, budget);
-        if (budget.look()) {  // the children may be missing, so the node stays
+        if (budget.look()) {  // children may be missing, so the node stays in OPEN
             push(id);
             return Outcome::paused;
         }
@@ -92,7 +93,7 @@ int ProvingSearch::pop() {
     return id;
 }
 
-// Makes the traffic that of node `id`.
+// Loads the paths of node `id` into the traffic; paths that stay the same are not touched.
 void ProvingSearch::load(int id) {
     if (traffic_.is_sparse()) {
         traffic_.reset(problem_->grid.layout);
@@ -102,18 +103,18 @@ void ProvingSearch::load(int id) {
     for (int at = id; at != none; at = nodes_[at].parent)
         for (int i = 0; i < nodes_[at].changes; ++i) {
             const auto& change = changes_[nodes_[at].first_change + static_cast<std::size_t>(i)];
-            if (wanted_[change.robot] == none) wanted_[change.robot] = change.track;
+            if (wanted_[change.robot] == none) wanted_[change.robot] = change.path;
         }
     for (std::size_t robot = 0; robot < num_robots_; ++robot) {
-        const int track = wanted_[robot] == none ? root_tracks_[robot] : wanted_[robot];
-        if (track == loaded_[robot]) continue;
+        const int path = wanted_[robot] == none ? root_paths_[robot] : wanted_[robot];
+        if (path == loaded_[robot]) continue;
         if (loaded_[robot] != none) traffic_.remove(view(loaded_[robot]));
-        traffic_.add(view(track));
-        loaded_[robot] = track;
+        traffic_.add(view(path));
+        loaded_[robot] = path;
     }
 }
 
-// The first conflict of each pair of robots.
+// Finds the first conflict of each pair of robots, by playing all paths step by step.
 void ProvingSearch::find_conflicts() {
     const auto steps = problem_->grid.layout.steps();
     conflicts_.clear();
@@ -128,7 +129,7 @@ void ProvingSearch::find_conflicts() {
             int& occupant = occupant_[cells_[robot]];
             if (occupant == none)
                 occupant = robot;
-            else if (time >= tracks_[loaded_[robot]].length)
+            else if (time >= paths_[loaded_[robot]].length)
                 add_conflict(robot, occupant, cells_[robot], time, idle);
             else
                 add_conflict(occupant, robot, cells_[robot], time, idle);
@@ -147,16 +148,18 @@ void ProvingSearch::add_conflict(int first, int second, int cell, int time, int 
     for (const auto& known : conflicts_)
         if ((known.first == first && known.second == second) || (known.first == second && known.second == first))
             return;
-    const bool at_rest = action == idle && time >= tracks_[loaded_[first]].length;
+    const bool at_rest = action == idle && time >= paths_[loaded_[first]].length;
     conflicts_.push_back({first, second, cell, time, action, at_rest});
 }
 
-// Raises the node's bound by what its dependent pairs cost at least; returns whether it grew.
+// Adds h to the node's cost; returns true if its bound has grown.
 bool ProvingSearch::compute_heuristic(int id, Budget& budget) {
     dependent_.clear();
-    // The pairwise dependency graph has an edge for each dependent pair; a vertex cover says who takes longer at least.
+    // The pairwise dependency graph has an edge for each dependent pair, one of whose robots takes longer: at least as
+    // many robots take longer as a minimum vertex cover has.
     for (const auto& conflict : conflicts_)
-        if (depend(conflict.first, conflict.second, budget)) dependent_.emplace_back(conflict.first, conflict.second);
+        if (are_dependent(conflict.first, conflict.second, budget))
+            dependent_.emplace_back(conflict.first, conflict.second);
     auto& node = nodes_[id];
     node.has_heuristic = true;
     const int bound = node.cost + cover_.size(dependent_);
@@ -166,16 +169,16 @@ bool ProvingSearch::compute_heuristic(int id, Budget& budget) {
 }
 
 void ProvingSearch::expand(int id, Budget& budget) {
-    const auto conflict = choose(budget);
+    const auto conflict = choose_conflict(budget);
     const int first = conflict.first, second = conflict.second;
-    const int first_length = tracks_[loaded_[first]].length, second_length = tracks_[loaded_[second]].length;
+    const int first_length = paths_[loaded_[first]].length, second_length = paths_[loaded_[second]].length;
     std::array<std::array<Constraint, 2>, 2> sides;
     if (conflict.at_rest) {
-        // Target: the first arrives later, or all others are past its goal by then.
+        // Target conflict: the first robot arrives later, or it arrives by then and no other robot visits its goal.
         sides[0][0] = {first, {}, conflict.time + 1, forever};
         sides[1][0] = {first, {}, 0, conflict.time};
-    } else if (depend(first, second, budget)) {
-        // Dependent pair: the first takes longer, or it does not and the second does.
+    } else if (are_dependent(first, second, budget)) {
+        // Dependent pair: the first robot takes longer, or it does not and the second does.
         sides[0][0] = {first, {}, first_length + 1, forever};
         sides[1][0] = {first, {}, 0, first_length};
         sides[1][1] = {second, {}, second_length + 1, forever};
@@ -194,27 +197,27 @@ void ProvingSearch::expand(int id, Budget& budget) {
     }
     std::array<int, 2> children{};
     for (int side = 0; side < 2; ++side) {
-        children[side] = branch(id, sides[side], budget);
+        children[side] = make_child(id, sides[side], budget);
         if (children[side] == none) continue;
         auto& child = nodes_[children[side]];
         if (child.changes != 1 || child.cost > nodes_[id].cost || child.conflicts >= nodes_[id].conflicts) continue;
-        // A bypass: the same cost and fewer conflicts, so the path alone will do, without the constraint.
+        // Bypass: a path of the same cost with fewer conflicts is adopted without a constraint; the node is not split.
         const auto& change = changes_[child.first_change];
-        tracks_[change.track].basis = tracks_[loaded_[change.robot]].basis;
+        paths_[change.path].planned_under = paths_[loaded_[change.robot]].planned_under;
         child.constraints = {};
-        keep(children[side]);
+        insert(children[side]);
         return;
     }
     for (const int child : children)
-        if (child != none) keep(child);
+        if (child != none) insert(child);
 }
 
-// Dependent pairs first, then conflicts that one of the two cannot avoid, then the earliest.
-const ProvingSearch::Conflict& ProvingSearch::choose(Budget& budget) {
+// Prefers dependent pairs, then semi-cardinal conflicts (one robot cannot avoid them), then the earliest.
+const ProvingSearch::Conflict& ProvingSearch::choose_conflict(Budget& budget) {
     std::size_t best = 0;
     int best_rank = forever;
     for (std::size_t i = 0; i < conflicts_.size(); ++i) {
-        const int own = rank(conflicts_[i], budget);
+        const int own = conflict_rank(conflicts_[i], budget);
         if (own > best_rank || (own == best_rank && conflicts_[i].time >= conflicts_[best].time)) continue;
         best = i;
         best_rank = own;
@@ -224,20 +227,20 @@ const ProvingSearch::Conflict& ProvingSearch::choose(Budget& budget) {
     return conflicts_[best];
 }
 
-int ProvingSearch::rank(const Conflict& conflict, Budget& budget) {
-    if (depend(conflict.first, conflict.second, budget)) return conflict.at_rest ? 0 : 1;
+int ProvingSearch::conflict_rank(const Conflict& conflict, Budget& budget) {
+    if (are_dependent(conflict.first, conflict.second, budget)) return conflict.at_rest ? 0 : 1;
     if (conflict.at_rest) return 2;
     for (const int robot : {conflict.first, conflict.second}) {
-        const auto& all = diagram(robot, tracks_[loaded_[robot]].basis, nullptr, budget);
+        const auto& all = diagram(robot, paths_[loaded_[robot]].planned_under, nullptr, budget);
         if (conflict.time > all.length || all.at(conflict.time).size() > 1) continue;
         if (conflict.action == idle || all.at(conflict.time - 1).size() == 1) return 2;
     }
     return 3;
 }
 
-// The child of the loaded node `id` that obeys more constraints, or none if some robot has no path. Its number is used
-// up in any case.
-int ProvingSearch::branch(int id, const std::array<Constraint, 2>& constraints, Budget& budget) {
+// Generates the child of the loaded node `id` with further constraints, and replans the robots that violate them.
+// Returns `none` if a robot has no path; the child's number is used up in any case.
+int ProvingSearch::make_child(int id, const std::array<Constraint, 2>& constraints, Budget& budget) {
     const int child = static_cast<int>(nodes_.size());
     nodes_.push_back(nodes_[id]);
     auto& node = nodes_.back();
@@ -253,18 +256,18 @@ int ProvingSearch::branch(int id, const std::array<Constraint, 2>& constraints, 
         if (latest == forever) continue;
         for (int other = 0; other < static_cast<int>(num_robots_); ++other) {
             if (other == robot || (other == constraints[1].robot && constraints[1].earliest > 0)) continue;
-            if (trespasses(other, problem_->goals[robot], latest)) possible = possible && replan(child, other, budget);
+            if (visits(other, problem_->goals[robot], latest)) possible = possible && replan(child, other, budget);
         }
     }
     const auto changes = std::span(changes_).subspan(node.first_change);
-    for (const auto& change : changes) traffic_.remove(view(change.track));
+    for (const auto& change : changes) traffic_.remove(view(change.path));
     for (const auto& change : changes) traffic_.add(view(loaded_[change.robot]));
     node.bound = std::max(node.bound, node.cost);
     return possible ? child : none;
 }
 
-// Whether the loaded path of `robot` is in the cell `goal` at the time `since` or later.
-bool ProvingSearch::trespasses(int robot, int goal, int since) const {
+// Returns true if the loaded path of `robot` is in the cell `goal` at the time `since` or later.
+bool ProvingSearch::visits(int robot, int goal, int since) const {
     const auto path = view(loaded_[robot]);
     int cell = path.start, time = 0;
     for (const int action : path.actions) {
@@ -274,6 +277,7 @@ bool ProvingSearch::trespasses(int robot, int goal, int since) const {
     return false;
 }
 
+// Replaces a robot's path by a shortest path under the child's constraints, with the fewest conflicts among those.
 bool ProvingSearch::replan(int child, int robot, Budget& budget) {
     const auto& all = diagram(robot, child, nullptr, budget);
     if (all.length < 0) return false;
@@ -283,25 +287,27 @@ bool ProvingSearch::replan(int child, int robot, Budget& budget) {
     node.conflicts -= traffic_.conflicts(old_path);
     node.conflicts += builder_.best_path(all, traffic_, new_actions_);
     node.cost += all.length - old_path.arrival();
-    const int track = store(robot, child, new_actions_);
-    traffic_.add(view(track));
-    changes_.push_back({robot, track});
+    const int path = store(robot, child, new_actions_);
+    traffic_.add(view(path));
+    changes_.push_back({robot, path});
     ++node.changes;
     return true;
 }
 
-void ProvingSearch::keep(int id) {
+// Pushes the node into OPEN; a conflict-free node that is cheaper than the incumbent replaces it.
+void ProvingSearch::insert(int id) {
     push(id);
     if (nodes_[id].conflicts > 0 || (best_ != none && nodes_[best_].cost <= nodes_[id].cost)) return;
     load(id);
     best_ = id;
-    best_tracks_ = loaded_;
+    best_paths_ = loaded_;
 }
 
-// Whether no two paths of the robots go together that are shortest under the constraints they were planned for.
-bool ProvingSearch::depend(int first, int second, Budget& budget) {
+// Returns true if no two shortest paths of the robots, under the constraints of their loaded paths, are compatible.
+bool ProvingSearch::are_dependent(int first, int second, Budget& budget) {
     if (first > second) std::swap(first, second);
-    const std::array<int, 4> key{first, tracks_[loaded_[first]].basis, second, tracks_[loaded_[second]].basis};
+    const std::array<int, 4> key{first, paths_[loaded_[first]].planned_under,
+                                 second, paths_[loaded_[second]].planned_under};
     auto& cached = pairs_[mixed(mixed(static_cast<std::size_t>(key[0]), static_cast<std::size_t>(key[1])),
                                 mixed(static_cast<std::size_t>(key[2]), static_cast<std::size_t>(key[3]))) %
                           pairs_.size()];
@@ -314,23 +320,24 @@ bool ProvingSearch::depend(int first, int second, Budget& budget) {
     return dependent;
 }
 
-// The robot's shortest paths under the constraints of node `basis`; `other` stays valid.
-const DecisionDiagram& ProvingSearch::diagram(int robot, int basis, const DecisionDiagram* other, Budget& budget) {
-    auto place = mixed(static_cast<std::size_t>(robot), static_cast<std::size_t>(basis)) % diagrams_.size();
+// Returns all shortest paths of the robot under the constraints of node `planned_under`; `other` stays valid.
+const DecisionDiagram& ProvingSearch::diagram(int robot, int planned_under, const DecisionDiagram* other,
+                                              Budget& budget) {
+    auto place = mixed(static_cast<std::size_t>(robot), static_cast<std::size_t>(planned_under)) % diagrams_.size();
     if (&diagrams_[place].diagram == other) place = (place + 1) % diagrams_.size();
     auto& cached = diagrams_[place];
-    if (cached.robot == robot && cached.basis == basis) return cached.diagram;
-    collect_constraints(robot, basis);
+    if (cached.robot == robot && cached.planned_under == planned_under) return cached.diagram;
+    collect_constraints(robot, planned_under);
     builder_.build(problem_->grid, problem_->starts[robot], problem_->goals[robot],
                    problem_->distances.to_goal_of(static_cast<std::size_t>(robot)), constraints_, cached.diagram, budget);
     cached.robot = budget.look() ? none : robot;
-    cached.basis = basis;
+    cached.planned_under = planned_under;
     return cached.diagram;
 }
 
-void ProvingSearch::collect_constraints(int robot, int basis) {
+void ProvingSearch::collect_constraints(int robot, int planned_under) {
     constraints_.clear();
-    for (int at = basis; at != none; at = nodes_[at].parent)
+    for (int at = planned_under; at != none; at = nodes_[at].parent)
         for (const auto& constraint : nodes_[at].constraints) {
             if (constraint.robot == none) continue;
             if (constraint.robot != robot) {
@@ -344,16 +351,16 @@ void ProvingSearch::collect_constraints(int robot, int basis) {
         }
 }
 
-int ProvingSearch::store(int robot, int basis, std::span<const std::uint8_t> actions) {
-    tracks_.push_back({robot, basis, actions_.size(), static_cast<int>(actions.size())});
+int ProvingSearch::store(int robot, int planned_under, std::span<const std::uint8_t> actions) {
+    paths_.push_back({robot, planned_under, actions_.size(), static_cast<int>(actions.size())});
     actions_.insert(actions_.end(), actions.begin(), actions.end());
-    return static_cast<int>(tracks_.size()) - 1;
+    return static_cast<int>(paths_.size()) - 1;
 }
 
-std::span<const std::uint8_t> ProvingSearch::stored(int track) const {
-    return std::span(actions_).subspan(tracks_[track].begin, static_cast<std::size_t>(tracks_[track].length));
+std::span<const std::uint8_t> ProvingSearch::stored(int path) const {
+    return std::span(actions_).subspan(paths_[path].begin, static_cast<std::size_t>(paths_[path].length));
 }
 
-PathView ProvingSearch::view(int track) const { return {problem_->starts[tracks_[track].robot], stored(track)}; }
+PathView ProvingSearch::view(int path) const { return {problem_->starts[paths_[path].robot], stored(path)}; }
 
 }  // namespace mapf

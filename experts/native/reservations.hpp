@@ -1,4 +1,4 @@
-// Who is in a cell and when, cell by cell: what a search over safe intervals reads.
+// The robots in each cell by time: the input of a search over safe intervals.
 #pragma once
 
 #include <algorithm>
@@ -61,7 +61,7 @@ public:
         rests_[end_of(path)] = {};
     }
 
-    // Who stays in `cell`, and from when on.
+    // The robot that stays in `cell`, and the time from which it does.
     Rest rest(int cell) const { return rests_[cell]; }
 
     // Calls use(robot) for each robot that is in `cell` at `time` and has not come to rest there before.

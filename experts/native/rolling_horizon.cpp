@@ -40,7 +40,7 @@ void RollingHorizon::plan(std::span<const int> cells, std::span<const int> goals
         table_of_[robot] = tables_[goals[robot]].data();
         under_way_[robot] = goals[robot] == goals_[robot] ? under_way_[robot] + std::max(executed, 1) : 0;
     }
-    // What is left of the last plan, or a new one of PIBT: whichever promises more.
+    // The rest of the last plan or a new one of PIBT, whichever promises more.
     const bool kept = keep_last_plan(cells, executed);
     cells_.assign(cells.begin(), cells.end());
     goals_.assign(goals.begin(), goals.end());

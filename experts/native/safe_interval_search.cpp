@@ -21,7 +21,7 @@ bool SafeIntervalSearch::run(const Grid& grid, const Reservations& others, int s
     // The start state: the interval of the start cell that holds time 0.
     others.intervals(start, 0, 0, [&](const Interval& interval) { reach(-1, start, 0, interval, 0); });
     while (!budget.spent()) {
-        // Pop the state with the fewest meetings, then the lowest f = time + distance.
+        // 1. Pop the state with the fewest conflicts, then the lowest f = time + distance.
         const int id = pop();
         if (id < 0) return false;
         const auto state = states_[id];
@@ -29,7 +29,7 @@ bool SafeIntervalSearch::run(const Grid& grid, const Reservations& others, int s
             trace(id);
             return true;
         }
-        // Dominance: a state of the same interval that was expanded from an earlier time covers this one.
+        // 2. Dominance: a state of the same interval that was expanded from an earlier time covers this one.
         auto& expanded = reached_(state.cell, state.end).expanded;
         if (expanded <= state.time) continue;
         expanded = state.time;
@@ -40,7 +40,7 @@ bool SafeIntervalSearch::run(const Grid& grid, const Reservations& others, int s
 
 void SafeIntervalSearch::expand(int id) {
     const auto state = states_[id];
-    // Goal test: the robot may stay for good, if those who pass later are tolerated.
+    // 3. Goal test: the robot may rest here if it tolerates the robots that pass later.
     if (state.cell == goal_) {
         int later = 0;
         if (state.end != forever)
@@ -53,7 +53,7 @@ void SafeIntervalSearch::expand(int id) {
             push(end);
         }
     }
-    // Successors: every safe interval of a neighbour cell that begins before this interval ends.
+    // 4. Successors: every interval of a neighbour cell that begins before this interval ends.
     for (int action = 0; action < idle; ++action) {
         const int cell = state.cell + steps_[action];
         if (distance_[cell] == unreachable) continue;
@@ -61,7 +61,7 @@ void SafeIntervalSearch::expand(int id) {
     }
 }
 
-// Moves into `cell` as early as possible during `interval`; where another robot comes the other way, also later.
+// Moves into `cell` as early as possible during `interval`, and also later if that avoids a swap conflict.
 void SafeIntervalSearch::enter(int from, int cell, const Interval& interval) {
     const auto state = states_[from];
     const int last = std::min(state.end, interval.end - 1);

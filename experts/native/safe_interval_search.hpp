@@ -1,4 +1,23 @@
-// The path of one robot that meets the fewest others, whatever its length: the low level of repair and improvement.
+// The path of one robot with the fewest conflicts, whatever its length: the low level of repair and improvement.
+//
+// Safe interval path planning (SIPP) with soft obstacles, "SIPPS" in the source below. The time line of each cell is
+// cut into intervals during which nothing changes; a busy one is occupied by another robot, and entering it is a
+// conflict:
+//
+//     cell X:   0 -- free -- 4 | 4 - busy - 5 | 5 ----- free ----> forever
+//     cell Y:   0 ------------ free --------- 7 | 7 -- busy -- 8 | 8 --> forever
+//
+// A state is (cell, interval, earliest time of arrival): waiting within an interval is not a step of the search. The
+// edge from X's first interval to Y's first one leads to the earliest time at which the robot can enter Y from X.
+//
+// Each turn of the loop in run():
+//     1. pop the state with the fewest conflicts, among those the one with the lowest f = time + distance to the goal
+//     2. dominance: skip it if its interval was expanded from an earlier time already
+//     3. goal test: the robot can rest on its goal if the robots that pass there later are tolerated as conflicts
+//     4. successors: all intervals of the four neighbour cells that begin before this interval ends
+//
+// Invariant: states are popped by ascending number of conflicts, so the first one that passes the goal test has the
+// fewest possible, and the least arrival time among paths with as many.
 #pragma once
 
 #include <array>
@@ -6,7 +25,7 @@
 #include <vector>
 
 #include "experts/native/budget.hpp"
-#include "experts/native/cell_time_table.hpp"
+#include "experts/native/pair_table.hpp"
 #include "experts/native/reservations.hpp"
 #include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/grid.hpp"
@@ -15,7 +34,7 @@ namespace mapf {
 
 // Safe interval path planning with soft obstacles (Li, Chen, Harabor, Stuckey and Koenig 2022, "MAPF-LNS2: fast
 // repairing for multi-agent path finding via large neighborhood search"): a state is a cell and one of its intervals,
-// so waiting costs nothing to search. Paths come in the order of the busy intervals they enter, then of their length.
+// so waiting costs nothing to search. Paths are found in the order of their conflicts, then of their length.
 class SafeIntervalSearch {
 public:
     // Returns true if there is a path that enters at most `tolerance` busy intervals and arrives by `latest`. It is then
@@ -27,7 +46,7 @@ public:
 
 private:
     struct State {
-        int cell, time, end, parent, meetings;  // the robot may stay until the interval's end
+        int cell, time, end, parent, meetings;  // `end` of the interval; `meetings` are conflicts so far
         bool arrived;
     };
     struct Reached {
@@ -57,7 +76,7 @@ private:
     int goal_ = 0, earliest_ = 0, tolerance_ = 0, latest_ = 0;
 
     std::vector<State> states_;
-    CellTimeTable<Reached> reached_;       // by cell and end of the interval
+    PairTable<Reached> reached_;       // by cell and end of the interval
     std::vector<std::vector<Open>> open_;  // by meetings; heaps
     std::size_t fewest_ = 0;
     std::vector<std::uint8_t> actions_;

@@ -79,7 +79,7 @@ void SpaceTimeSearch::step(int id, int action, const Passage& traffic_here) {
     if (cell == journey_.goal) arrive(next);
 }
 
-// The robot stands on its goal: where it may stay there for ever, that is an end of the search.
+// The robot stands on its goal: if it may stay there forever, the search ends.
 void SpaceTimeSearch::arrive(int id) {
     const auto& state = states_[id];
     if (state.time < journey_.earliest) return;

@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "experts/native/budget.hpp"
-#include "experts/native/cell_time_table.hpp"
+#include "experts/native/pair_table.hpp"
 #include "experts/native/traffic.hpp"
 #include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/grid.hpp"
@@ -27,7 +27,7 @@ struct Journey {
 // level are not generated before that level begins, which on most searches is never.
 class SpaceTimeSearch {
 public:
-    // Whether a path exists (false also if the budget is spent). The path is then in actions() until the next search.
+    // Returns true if a path exists, which actions() has until the next search; false also if the budget is spent.
     bool run(const Layout& layout, const Traffic& traffic, const Journey& journey, Budget& budget);
 
     const std::vector<std::uint8_t>& actions() const { return actions_; }
@@ -59,7 +59,7 @@ private:
     int level_ = 0;
 
     std::vector<State> states_;
-    CellTimeTable<Reached> reached_;
+    PairTable<Reached> reached_;
     std::vector<std::vector<int>> stacks_;  // open states of this level by conflicts; ~id is an arrival
     std::size_t fewest_ = 0;                // no stack below this one holds a state
     std::vector<int> rim_, older_rim_;      // expanded states with e = level, and with e = level - 1

@@ -1,4 +1,4 @@
-// Who passes where and when: the paths of all other robots, and what is forbidden to the one that is planned.
+// The paths of all other robots by cell and time, and the constraints on the robot that is planned.
 #pragma once
 
 #include <algorithm>
@@ -9,7 +9,7 @@
 #include <span>
 #include <vector>
 
-#include "experts/native/cell_time_table.hpp"
+#include "experts/native/pair_table.hpp"
 #include "mapf_env/native/grid.hpp"
 
 namespace mapf {
@@ -26,7 +26,7 @@ struct PathView {
 
 inline int reversed(int action) { return action ^ 2; }  // up <-> down, left <-> right
 
-// What happens in one cell at one time.
+// The events in one cell at one time.
 struct Passage {
     std::array<std::uint16_t, 4> by_move{};  // robots that enter by this move
     std::uint16_t robots = 0;                // robots in the cell
@@ -51,7 +51,7 @@ public:
     // No path that was added arrives later than this.
     int horizon() const { return horizon_; }
 
-    // Whether most of the memory holds cells and times that nobody passes any more.
+    // True if most of the table holds cells and times that no path passes any more.
     bool is_sparse() const { return passages_.size() > 4 * (steps_taken_ + 1024); }
 
     void forbid(int cell, int time, std::uint8_t actions) { passages_(cell, time).forbidden |= actions; }
@@ -99,8 +99,8 @@ private:
     }
 
     std::array<int, num_actions> steps_{};
-    CellTimeTable<Passage> passages_;
-    std::vector<int> settled_;  // from when on a robot rests in the cell for ever
+    PairTable<Passage> passages_;
+    std::vector<int> settled_;  // from when on a robot rests in the cell forever
     int horizon_ = 0;
     std::size_t steps_taken_ = 0;  // by all robots together
 };

@@ -1,4 +1,4 @@
-// Python's view of the world's kernels: shapes are checked here, the kernels trust them.
+// The Python interface of the kernels: shapes are checked here, the kernels trust them.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -47,13 +47,13 @@ void write_obstacles(const mapf::Grid& grid, bool* out) {
         for (int col = 0; col < grid.layout.width; ++col) *out++ = grid.blocked[grid.layout.cell(row, col)] != 0;
 }
 
-// The layout of maps (B, rows, cols) that carry a border of `pad` obstacles.
+// The layout of maps (B, rows, cols) that carry a border of `border` obstacles.
 template <class Array>
-Layout layout_of(const Array& obstacles, int pad) {
+Layout layout_of(const Array& obstacles, int border) {
     const int rows = static_cast<int>(obstacles.shape(1)), cols = static_cast<int>(obstacles.shape(2));
-    require(pad >= 1 && rows > 2 * pad && cols > 2 * pad, "obstacles must have a border of pad >= 1 cells");
-    const Layout layout{rows - 2 * pad, cols - 2 * pad, pad};
-    // Who floods or moves relies on it: there is no way out of the map.
+    require(border >= 1 && rows > 2 * border && cols > 2 * border, "obstacles must have a border of at least one cell");
+    const Layout layout{rows - 2 * border, cols - 2 * border, border};
+    // Flood fills and moves rely on this: no step leads off the map.
     bool closed = true;
     for (std::size_t b = 0; b < obstacles.shape(0); ++b) {
         const auto* map = obstacles.data() + b * layout.size();
@@ -143,11 +143,11 @@ std::tuple<Out<std::int32_t>, Out<std::int32_t>> place_agents(In<std::uint64_t, 
 }
 
 template <class T>
-void observe(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, In<std::int32_t, 3> goals, int radius,
+void observe(In<T, 3> obstacles, int border, In<std::int32_t, 3> positions, In<std::int32_t, 3> goals, int radius,
              InOut<T, 5> out) {
-    const auto layout = layout_of(obstacles, pad);
+    const auto layout = layout_of(obstacles, border);
     const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1), side = 2 * radius + 3;
-    require(radius >= 1 && pad >= radius, "obstacles need a border of at least the field of view's radius");
+    require(radius >= 1 && border >= radius, "obstacles need a border of at least the field of view's radius");
     require_on_map(positions, layout, num_envs, "positions");
     require_on_map(goals, layout, num_envs, "goals");
     require(goals.shape(1) == num_agents, "give one goal for each agent");
@@ -177,9 +177,9 @@ void communication_graph(In<std::int32_t, 3> positions, In<double, 1> radius, bo
 }
 
 template <class T>
-Out<std::int8_t> shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, In<std::int64_t, 2> actions,
+Out<std::int8_t> shield(In<T, 3> obstacles, int border, In<std::int32_t, 3> positions, In<std::int64_t, 2> actions,
                         In<std::uint64_t, 1> seeds, In<std::int64_t, 1> times) {
-    const auto layout = layout_of(obstacles, pad);
+    const auto layout = layout_of(obstacles, border);
     const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1);
     require_on_map(positions, layout, num_envs, "positions");
     if (actions.shape(0) != num_envs || actions.shape(1) != num_agents)
@@ -212,8 +212,8 @@ Out<std::int32_t> move(In<std::int32_t, 3> positions, In<std::int64_t, 2> action
 }
 
 template <class T>
-Out<std::int8_t> action_mask(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions) {
-    const auto layout = layout_of(obstacles, pad);
+Out<std::int8_t> action_mask(In<T, 3> obstacles, int border, In<std::int32_t, 3> positions) {
+    const auto layout = layout_of(obstacles, border);
     const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1);
     require_on_map(positions, layout, num_envs, "positions");
     auto [mask, out] = make_array<std::int8_t>({num_envs, num_agents, mapf::num_actions});
@@ -250,8 +250,8 @@ double connecting_radius(In<std::int32_t, 2> positions, double radius) {
 }
 
 template <class T>
-Out<mapf::Distance> distance_tables(In<T, 3> obstacles, int pad, In<std::int32_t, 3> goals) {
-    const auto layout = layout_of(obstacles, pad);
+Out<mapf::Distance> distance_tables(In<T, 3> obstacles, int border, In<std::int32_t, 3> goals) {
+    const auto layout = layout_of(obstacles, border);
     const std::size_t num_envs = obstacles.shape(0), num_agents = goals.shape(1), size = layout.size();
     require_on_map(goals, layout, num_envs, "goals");
     auto [tables, out] = make_array<mapf::Distance>({num_envs, num_agents, size});
@@ -269,11 +269,11 @@ Out<mapf::Distance> distance_tables(In<T, 3> obstacles, int pad, In<std::int32_t
 }
 
 template <class T>
-Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, In<float, 3> values,
+Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int border, In<std::int32_t, 3> positions, In<float, 3> scores,
                              In<std::int64_t, 2> actions, In<std::int32_t, 2> under_way, In<std::uint64_t, 1> seeds,
                              In<std::int64_t, 1> times, std::optional<In<std::int32_t, 3>> goals,
                              std::optional<In<mapf::Distance, 3>> distances) {
-    const auto layout = layout_of(obstacles, pad);
+    const auto layout = layout_of(obstacles, border);
     const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1), size = layout.size();
     require_on_map(positions, layout, num_envs, "positions");
     const bool swap = goals.has_value() && distances.has_value();
@@ -283,14 +283,14 @@ Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> po
                     distances->shape(1) == num_agents && distances->shape(2) == size,
                 "goals must have shape (B, N, 2) and distances be the distance tables of these goals");
     }
-    const bool by_values = values.size() > 0;
-    const std::size_t robots = by_values ? values.shape(1) : actions.shape(1);
-    require((by_values ? values.shape(0) : actions.shape(0)) == num_envs && robots == num_agents,
-            "actions must have shape (B, N) or, as values of all five, (B, N, 5)");
-    require(!by_values || values.shape(2) == mapf::num_actions, "values of actions must have shape (B, N, 5)");
-    for (std::size_t i = 0; i < values.size(); ++i)
-        require(!std::isnan(values.data()[i]), "the values of actions must be numbers");
-    if (!by_values) mapf::require_actions(actions.data(), num_envs, num_agents);
+    const bool by_scores = scores.size() > 0;
+    const std::size_t robots = by_scores ? scores.shape(1) : actions.shape(1);
+    require((by_scores ? scores.shape(0) : actions.shape(0)) == num_envs && robots == num_agents,
+            "actions must have shape (B, N) or, as scores of all five, (B, N, 5)");
+    require(!by_scores || scores.shape(2) == mapf::num_actions, "scores of actions must have shape (B, N, 5)");
+    for (std::size_t i = 0; i < scores.size(); ++i)
+        require(!std::isnan(scores.data()[i]), "the scores of actions must be numbers");
+    if (!by_scores) mapf::require_actions(actions.data(), num_envs, num_agents);
     require(under_way.shape(0) == num_envs && under_way.shape(1) == num_agents, "under_way must have shape (B, N)");
     require(seeds.shape(0) == num_envs && times.shape(0) == num_envs, "give one seed and time for each environment");
     auto [executed, out] = make_array<std::int8_t>({num_envs, num_agents});
@@ -301,8 +301,8 @@ Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> po
         const std::size_t first = b * num_agents;
         const std::uint64_t key = mapf::mix(mapf::seed_for(mapf::Use::preferences, seeds(b)), times(b));
         for (std::size_t i = 0; i < num_agents; ++i)
-            if (by_values)
-                mapf::prefer_values(values.data() + (first + i) * mapf::num_actions,
+            if (by_scores)
+                mapf::prefer_scores(scores.data() + (first + i) * mapf::num_actions,
                                     &scratch.preferences[i * mapf::num_actions]);
             else
                 mapf::prefer_action(static_cast<int>(actions.data()[first + i]), mapf::mix(key, i),
@@ -326,9 +326,9 @@ Out<std::int8_t> pibt_shield(In<T, 3> obstacles, int pad, In<std::int32_t, 3> po
 }
 
 template <class T>
-void draw_goals(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, InOut<std::int32_t, 3> goals,
+void draw_goals(In<T, 3> obstacles, int border, In<std::int32_t, 3> positions, InOut<std::int32_t, 3> goals,
                 In<std::int32_t, 2> arrivals, In<bool, 2> arrived, In<std::uint64_t, 1> seeds) {
-    const auto layout = layout_of(obstacles, pad);
+    const auto layout = layout_of(obstacles, border);
     const std::size_t num_envs = obstacles.shape(0), num_agents = positions.shape(1), size = layout.size();
     require_on_map(positions, layout, num_envs, "positions");
     require_on_map(goals, layout, num_envs, "goals");
@@ -354,25 +354,25 @@ void draw_goals(In<T, 3> obstacles, int pad, In<std::int32_t, 3> positions, InOu
 // The kernels whose maps are stored as T, so that views are copied and not converted.
 template <class T>
 void define_for_dtype(nb::module_& m) {
-    m.def("observe", &observe<T>, "obstacles"_a, "pad"_a, "positions"_a, "goals"_a, "radius"_a, "out"_a.noconvert(),
+    m.def("observe", &observe<T>, "obstacles"_a, "border"_a, "positions"_a, "goals"_a, "radius"_a, "out"_a.noconvert(),
           "Write every robot's field of view into out (B, N, 3, 2 * radius + 3, 2 * radius + 3).");
-    m.def("shield", &shield<T>, "obstacles"_a, "pad"_a, "positions"_a, "actions"_a, "seeds"_a, "times"_a,
+    m.def("shield", &shield<T>, "obstacles"_a, "border"_a, "positions"_a, "actions"_a, "seeds"_a, "times"_a,
           "(B, N) int8 actions that the paper's collision shield lets through; ties are drawn by seed and time.");
-    m.def("action_mask", &action_mask<T>, "obstacles"_a, "pad"_a, "positions"_a,
+    m.def("action_mask", &action_mask<T>, "obstacles"_a, "border"_a, "positions"_a,
           "(B, N, 5) int8, 1 for each action that neither leaves the map nor enters an obstacle.");
-    m.def("distance_tables", &distance_tables<T>, "obstacles"_a, "pad"_a, "goals"_a,
+    m.def("distance_tables", &distance_tables<T>, "obstacles"_a, "border"_a, "goals"_a,
           "(B, N, size) uint16 steps from each cell of the bordered map to each goal; 65535 where there is no way.");
-    m.def("pibt_shield", &pibt_shield<T>, "obstacles"_a, "pad"_a, "positions"_a, "values"_a, "actions"_a,
+    m.def("pibt_shield", &pibt_shield<T>, "obstacles"_a, "border"_a, "positions"_a, "scores"_a, "actions"_a,
           "under_way"_a, "seeds"_a, "times"_a, "goals"_a = nb::none(), "distances"_a = nb::none(),
-          "(B, N) int8 actions by priority inheritance, from values (B, N, 5) or, if these are empty, actions (B, N).");
-    m.def("draw_goals", &draw_goals<T>, "obstacles"_a, "pad"_a, "positions"_a, "goals"_a.noconvert(), "arrivals"_a,
+          "(B, N) int8 actions by priority inheritance, from scores (B, N, 5) or, if these are empty, actions (B, N).");
+    m.def("draw_goals", &draw_goals<T>, "obstacles"_a, "border"_a, "positions"_a, "goals"_a.noconvert(), "arrivals"_a,
           "arrived"_a, "seeds"_a, "Replace the goals (B, N, 2) of the robots that have arrived (B, N) by new ones.");
 }
 
 }  // namespace
 
 NB_MODULE(_native, m) {
-    m.doc() = "Native kernels of the world: distances, maps, shield, views and communication graphs, over batches.";
+    m.doc() = "Native kernels: distances, maps, shield, views and communication graphs, over batches.";
     m.def("regions", &regions, "grid"_a, "(H, W) int32 number of the region of each cell; -1 on obstacles.");
     m.def("distances", &distances, "grid"_a, "cells"_a,
           "(M, H, W) int32 steps from each cell to each of M free cells (M, 2); -1 where there is no way.");

@@ -1,4 +1,4 @@
-// What Python's callers are told of arguments that do not fit. Only bindings include this.
+// Error messages for wrong arguments from Python. Only bindings include this.
 #pragma once
 
 #include <nanobind/nanobind.h>

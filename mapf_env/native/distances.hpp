@@ -57,10 +57,10 @@ void distances_by_words(const Grid& grid, int goal, Distance* distance) {
         any = 0;
         for (int word = 0; word < words; ++word) {
             const Word* const here = level.data() + margin + word;
-            const Word beside = here[0] << 1 | here[-1] >> (word_bits - 1) | here[0] >> 1 | here[1] << (word_bits - 1);
+            const Word sideways = here[0] << 1 | here[-1] >> (word_bits - 1) | here[0] >> 1 | here[1] << (word_bits - 1);
             const Word below = here[-whole] << part | here[-whole - 1] >> 1 >> (word_bits - 1 - part);
             const Word above = here[whole] >> part | here[whole + 1] << 1 << (word_bits - 1 - part);
-            next[word] = (beside | below | above) & unseen[word];
+            next[word] = (sideways | below | above) & unseen[word];
             any |= next[word];
         }
     }

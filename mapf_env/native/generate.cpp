@@ -34,7 +34,7 @@ public:
     }
 
 private:
-    // Whether the free neighbours of the newly blocked `cell` still reach each other.
+    // Returns true if the free neighbours of the newly blocked `cell` still reach each other.
     bool neighbours_connected(int cell) {
         const int stride = layout().stride();
         const std::array<int, 8> ring{-stride, -stride + 1, 1, stride + 1, stride, stride - 1, -1, -stride - 1};

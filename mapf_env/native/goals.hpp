@@ -1,4 +1,4 @@
-// New goals for robots that have arrived, where the task goes on for ever.
+// New goals for robots that have arrived, in lifelong tasks.
 #pragma once
 
 #include <cstdint>
@@ -9,13 +9,13 @@
 
 namespace mapf {
 
-// What draws the goal that a robot gets at its arrival number `arrival` of an episode.
+// The random stream for the goal that a robot gets at its arrival number `arrival` of an episode.
 inline Random goal_random(std::uint64_t seed, int robot, int arrival) {
     return Random(mix(mix(seed_for(Use::goals, seed), robot), arrival));
 }
 
-// A goal for a robot: uniform over the free cells that it can reach, that are no robot's goal and where it does not
-// stand; if there is none, it keeps its goal. `regions` (layout.size()) numbers the connected regions, obstacles are -1;
+// A goal for a robot: uniform over the free cells that it can reach, except for all robots' goals and its own
+// cell; if there is none, it keeps its goal. `regions` (layout.size()) numbers the connected regions, obstacles are -1;
 // `taken` (layout.size()) has a 1 at each goal and is kept so. Returns whether the goal has changed.
 inline bool draw_goal(const Layout& layout, const std::int32_t* regions, const std::int32_t* position, Random random,
                       std::uint8_t* taken, std::int32_t* goal) {

@@ -1,4 +1,4 @@
-// Who hears whom.
+// The communication graph: which robot hears which.
 #pragma once
 
 #include <cstdint>

@@ -17,16 +17,16 @@ inline constexpr int idle = 4;
 inline constexpr std::array<int, num_actions> row_step{-1, 0, 1, 0, 0};
 inline constexpr std::array<int, num_actions> col_step{0, -1, 0, 1, 0};
 
-// Geometry of a height x width map inside a border of `pad` obstacle cells.
+// Geometry of a height x width map inside a border of `border` obstacle cells.
 struct Layout {
-    int height, width, pad;
+    int height, width, border;
 
-    int stride() const { return width + 2 * pad; }
-    int rows() const { return height + 2 * pad; }
+    int stride() const { return width + 2 * border; }
+    int rows() const { return height + 2 * border; }
     int size() const { return rows() * stride(); }
-    int cell(int row, int col) const { return (row + pad) * stride() + col + pad; }
-    int row(int cell) const { return cell / stride() - pad; }
-    int col(int cell) const { return cell % stride() - pad; }
+    int cell(int row, int col) const { return (row + border) * stride() + col + border; }
+    int row(int cell) const { return cell / stride() - border; }
+    int col(int cell) const { return cell % stride() - border; }
     bool contains(int row, int col) const { return row >= 0 && row < height && col >= 0 && col < width; }
     std::array<int, num_actions> steps() const { return {-stride(), -1, stride(), 1, 0}; }
 };

@@ -10,8 +10,8 @@ namespace mapf {
 
 namespace {
 
-// Where a goal `down` and `right` of the robot is drawn in a view of `radius`: in its place, or, if it is out of sight,
-// on the ring, along the line to it, halves rounded to the even cell. Returns the index in a plane.
+// Returns the index in a plane at which a goal `down` and `right` of the robot is drawn in a view of `radius`: its own
+// cell, or if it is out of sight the ring, along the line to it, halves rounded to the even cell.
 inline int goal_index(int down, int right, int radius) {
     // In double, a quotient is a half exactly where the true one is, and adding 1.5 * 2^52 rounds halves to even.
     constexpr double rounder = 6755399441055744.0;

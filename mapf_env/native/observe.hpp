@@ -1,4 +1,4 @@
-// What robots see: their fields of view.
+// The robots' fields of view.
 #pragma once
 
 #include <algorithm>
@@ -46,7 +46,7 @@ inline void copy_window(const T* from, int stride, int any_radius, T* out) {
 // side = 2 * radius + 3, of which the first three planes are written. The inner window is the view; the ring around it
 // only carries the goal when that is out of sight. Planes: obstacles (outside the map counts as one), the own goal, all
 // robots in view including oneself.
-//   obstacles  the map in its layout, as T, which is float or std::uint8_t; layout.pad >= radius
+//   obstacles  the map in its layout, as T, which is float or std::uint8_t; layout.border >= radius
 //   marks      layout.size() zeros; zeros again on return
 template <class T>
 void observe(const Layout& layout, const T* obstacles, const std::int32_t* positions, const std::int32_t* goals,

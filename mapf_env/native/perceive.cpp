@@ -49,15 +49,15 @@ nb::list feature_rows(std::span<const Row> table, int memory) {
     return rows;
 }
 
-// Maps of any sizes inside borders of `pad` obstacles, one after the other in one array.
+// Maps of any sizes inside borders of `border` obstacles, one after the other in one array.
 template <class T>
 struct Maps {
     In<T, 1> cells;
     In<std::int64_t, 1> offsets;  // (M)
     In<std::int32_t, 2> sizes;    // (M, 2) height and width
-    int pad;
+    int border;
 
-    Layout layout(std::size_t map) const { return {sizes(map, 0), sizes(map, 1), pad}; }
+    Layout layout(std::size_t map) const { return {sizes(map, 0), sizes(map, 1), border}; }
     const T* obstacles(std::size_t map) const { return cells.data() + offsets(map); }
 };
 
@@ -98,7 +98,7 @@ template <class T>
 template <class T>
 void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& senses) {
     const std::size_t count = states.size(), R = states.positions.shape(0), num_maps = maps.offsets.shape(0);
-    require(maps.pad >= senses.fov_radius, "the maps need a border of at least fov_radius: make the MapSet with a larger one");
+    require(maps.border >= senses.fov_radius, "the maps need a border of at least fov_radius: make the MapSet with a larger one");
     require(maps.sizes.shape(0) == num_maps && maps.sizes.shape(1) == 2, "give a height and width for each map");
     require(states.offsets.shape(0) == count + 1 && states.offsets(0) == 0, "offsets must have shape (T + 1,) and begin with 0");
     for (std::size_t t = 0; t < count; ++t)
@@ -130,9 +130,9 @@ void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& 
         if (states.limits(t) < 1) fail("the limit" + where() + " must be at least 1");
         if (!(states.comm_radius(t) >= 0.0)) fail("the comm_radius" + where() + " must not be negative");
         const Layout layout = maps.layout(states.maps(t));
-        const std::int64_t first_cell = maps.offsets(states.maps(t)), border = 2 * maps.pad;
+        const std::int64_t first_cell = maps.offsets(states.maps(t)), margin = 2 * maps.border;
         require(layout.height > 0 && layout.width > 0 && first_cell >= 0 &&
-                    first_cell + (layout.height + border) * (layout.width + border) <=
+                    first_cell + (layout.height + margin) * (layout.width + margin) <=
                         static_cast<std::int64_t>(maps.cells.size()),
                 "the maps do not fit into their memory");
         const T* obstacles = maps.obstacles(states.maps(t));
@@ -223,17 +223,17 @@ template <class T>
 void define_for_dtype(nb::module_& m) {
     m.def(
         "perceive",
-        [](In<T, 1> cells, In<std::int64_t, 1> map_offsets, In<std::int32_t, 2> map_sizes, int pad,
+        [](In<T, 1> cells, In<std::int64_t, 1> map_offsets, In<std::int32_t, 2> map_sizes, int border,
            In<std::int32_t, 1> maps, In<std::int64_t, 1> offsets, In<std::int32_t, 2> positions,
            In<std::int32_t, 2> goals, In<std::int8_t, 2> moves, In<std::int32_t, 1> under_way,
            In<std::uint64_t, 1> seeds, In<std::int32_t, 1> times, In<std::int32_t, 1> limits,
            In<double, 1> comm_radius, nb::handle senses, double message_loss, int threads) {
             return perceive_states<T>(
-                {cells, map_offsets, map_sizes, pad},
+                {cells, map_offsets, map_sizes, border},
                 {maps, offsets, positions, goals, moves, under_way, seeds, times, limits, comm_radius},
                 senses_of(senses), message_loss, threads);
         },
-        "cells"_a, "map_offsets"_a, "map_sizes"_a, "pad"_a, "maps"_a, "offsets"_a, "positions"_a, "goals"_a, "moves"_a,
+        "cells"_a, "map_offsets"_a, "map_sizes"_a, "border"_a, "maps"_a, "offsets"_a, "positions"_a, "goals"_a, "moves"_a,
         "under_way"_a, "seeds"_a, "times"_a, "limits"_a, "comm_radius"_a, "senses"_a, "message_loss"_a, "threads"_a,
         "The bag (fov, scalars, edge_index, edge_weight, edge_attr, team) of joint states on maps of any sizes.");
 }

@@ -30,11 +30,11 @@ inline void prefer_action(int action, std::uint64_t key, std::uint8_t* preferenc
     }
 }
 
-// The actions by descending value, equal ones in the order up, left, down, right, idle.
-inline void prefer_values(const float* values, std::uint8_t* preference) {
+// The actions by descending score, equal ones in the order up, left, down, right, idle.
+inline void prefer_scores(const float* scores, std::uint8_t* preference) {
     std::iota(preference, preference + num_actions, std::uint8_t{0});
     for (int i = 1; i < num_actions; ++i)  // a stable insertion sort of five
-        for (int j = i; j > 0 && values[preference[j]] > values[preference[j - 1]]; --j)
+        for (int j = i; j > 0 && scores[preference[j]] > scores[preference[j - 1]]; --j)
             std::swap(preference[j], preference[j - 1]);
 }
 
@@ -58,7 +58,7 @@ struct PibtScratch {
 };
 
 // Executes the orders of preference in `scratch`, with swaps as PibtStep::decide takes them. Robots that have been under
-// way (N) for longest come first, equal ones in the order that `key` draws. `blocked` is the map in its layout, pad >= 1.
+// way (N) for longest come first, equal ones in the order that `key` draws. `blocked` is the map in its layout, border >= 1.
 template <class T, class Swaps = NoSwaps>
 void pibt_shield(const Layout& layout, const T* blocked, const std::int32_t* positions, const std::int32_t* under_way,
                  int num_agents, std::uint64_t key, PibtScratch<T>& scratch, std::int8_t* executed,

@@ -1,11 +1,23 @@
 // One step of priority inheritance with backtracking (Okumura, Machida, Defago and Tamura 2022, "Priority inheritance
-// with backtracking for iterative multi-agent path finding"): joint moves without a conflict, whatever is preferred.
+// with backtracking for iterative multi-agent path finding"): a joint move without conflicts, whatever the preferences.
 //
-// A robot reserves its most preferred free cell; a robot that stands there inherits the priority and moves first.
+// Robots plan in order of priority. plan(robot) goes through the robot's candidates, the most preferred first:
+//     1. skip a cell that is blocked, reserved, or left by a robot that comes the other way (a swap conflict)
+//     2. reserve the cell
+//     3. priority inheritance: a robot that stands there and has no move yet plans next, with this robot's priority
+//     4. backtracking: if that robot finds no move, try the next candidate; with none left, stay and report failure
+//
+//     priority 1, 2, 3 from the left; everybody wants to go right, and # is an obstacle:
+//         1 > 2 > 3 #     1 reserves 2's cell, so 2 plans; 2 reserves 3's cell, so 3 plans; 3 finds no free cell
+//                         and fails, then 2 looks for another cell, then 1
+//
 // Invariant: the cells in next_ are distinct and no two robots exchange cells, also while a push is backtracked.
 //
 // With swaps (Okumura 2023, "Improving LaCAM for scalable eventually optimal multi-agent pathfinding") two robots that
-// face each other in a corridor change places: one backs out to where the corridor branches and pulls the other along.
+// face each other in a corridor change places: one backs out to where the corridor branches, and pulls the other along:
+//
+//     a > < b . .     b has to give way: it takes its candidates in reverse order, which leads it away from its goal,
+//           .         and a follows into the cell that b leaves, until b can step aside into the branch
 #pragma once
 
 #include <algorithm>
@@ -19,7 +31,7 @@
 
 namespace mapf {
 
-// Swaps are off: PIBT as it was first published.
+// No swaps: the original PIBT.
 struct NoSwaps {
     static constexpr bool on = false;
 };
@@ -34,7 +46,7 @@ struct TableSwaps {
     bool nearer(int robot, int from, int to) const { return distance_of(robot)[to] < distance_of(robot)[from]; }
 };
 
-// The memory of the steps on maps of one layout, pad >= 1, whose obstacles are the cells that are not T{0}.
+// Plans steps on maps of one layout with border >= 1; obstacles are the cells that are not T{0}. Arrays are reused.
 template <class T = std::uint8_t>
 class PibtStep {
 public:
@@ -78,7 +90,7 @@ public:
 private:
     static constexpr int nobody = -1;
 
-    // Whether the move that is fixed for the robot goes with those fixed before.
+    // Reserves the target of a fixed move; returns false if it conflicts with the moves fixed before.
     bool fix(int robot) {
         const int cell = cells_[robot], target = cell + steps_[actions_[robot]];
         if (next_[target] != nobody) return false;
@@ -87,7 +99,7 @@ private:
         return other == nobody || other == robot || next_[cell] != other;
     }
 
-    // Finds a move for the robot and those it pushes. If there is none it returns false, and the robot stays.
+    // Finds a move for the robot and the robots that it pushes. Returns false if there is none; then the robot stays.
     template <class Swaps>
     bool plan(int robot, int pusher, const Swaps& swaps) {
         const int cell = cells_[robot];
@@ -103,20 +115,22 @@ private:
             count = candidates.count;
         }
         for (int rank = 0; rank < count; ++rank) {
+            // 1. Skip cells that cannot be entered.
             const std::uint8_t action = wanted[rank];
             const int target = cell + steps_[action];
             if (blocked_[target] != T{0} || next_[target] != nobody) continue;
             const int other = now_[target];
             const bool occupied = other != nobody && other != robot;
             if (occupied && actions_[other] != undecided && cells_[other] + steps_[actions_[other]] == cell) continue;
+            // 2. Reserve the cell.
             actions_[robot] = action;
             next_[target] = robot;
-            // Priority inheritance: a robot that stands in the target has to find a move of its own.
+            // 3. Priority inheritance: a robot that stands there has to find a move of its own.
             if (occupied && actions_[other] == undecided && !plan(other, robot, swaps)) continue;
             if (Swaps::on && rank == 0 && partner != nobody) pull(partner, cell);
             return true;
         }
-        // Backtracking: a robot that wants this cell has to step back, unless its move was fixed.
+        // 4. Backtracking: the robot stays; a robot that has reserved its cell gives it up, unless that move was fixed.
         const int claimant = next_[cell];
         if (claimant == nobody || claimant == pusher) {
             actions_[robot] = idle;
@@ -158,7 +172,7 @@ private:
         if (ahead != nobody && actions_[ahead] == undecided && swap_required(robot, ahead, cell, target, swaps) &&
             swap_possible(target, cell, swaps))
             return ahead;
-        // Clear operation: a robot beside it would have to swap if this one went ahead, so this one waits outside.
+        // Clear operation: a neighbour would have to swap if this robot went ahead, so this robot waits outside.
         for (int action = 0; action < idle; ++action) {
             const int side = cell + steps_[action], other = now_[side];
             if (other == nobody || side == target) continue;
@@ -218,7 +232,7 @@ private:
     }
 
     std::array<int, num_actions> steps_;
-    std::vector<int> now_, next_;  // who is in a cell, who will be
+    std::vector<int> now_, next_;  // the robot in each cell now and after the step, or nobody
     const T* blocked_ = nullptr;
     std::span<const int> cells_;
     std::span<const std::uint8_t> preferences_;

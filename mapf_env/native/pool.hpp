@@ -63,7 +63,7 @@ private:
     // The gate: the number of the round, whether it is closed, and how many workers are inside.
     static constexpr std::uint64_t inside = 0xffff, closed = 0x10000, round = 0x20000;
 
-    // How long a thread spins before it sleeps: longer than Python takes between two steps.
+    // Time that a thread spins before it sleeps: longer than Python takes between two steps.
     static constexpr std::chrono::microseconds patience{100};
 
     // Waits for `ready` at most so long; whether it is.

@@ -15,8 +15,8 @@ inline std::uint64_t mix(std::uint64_t seed, std::uint64_t counter) {
     return z ^ (z >> 31);
 }
 
-// What a seed is used for. Each use has a stream of draws of its own: where robots start must say nothing about where
-// the obstacles of the same seed are.
+// The uses of a seed. Each use has its own random stream: robots' starts must not depend on the obstacles of the same
+// seed.
 enum class Use : std::uint64_t { map, placement, ties, priorities, preferences, messages, goals };
 
 inline std::uint64_t seed_for(Use use, std::uint64_t seed) { return mix(seed, static_cast<std::uint64_t>(use)); }

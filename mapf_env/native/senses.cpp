@@ -31,8 +31,8 @@ constexpr auto hide_nothing = [](int, bool) {};
 
 // ---- channels: each writes the plane of every robot of a team
 
-// How many steps more than from here the goal is away from each cell in view, within -2 * radius..2 * radius; cells
-// without a way have 2 * radius. As float that is divided by 2 * radius; as a byte it is counted from -2 * radius.
+// The distance to the goal from each cell in view minus that from the robot's cell, clipped to -2 * radius..2 * radius;
+// unreachable cells have 2 * radius. Floats are divided by 2 * radius; bytes are offset by 2 * radius.
 template <class T>
 void write_cost_to_go(const TeamFacts& team, int radius, int num_planes, T*, T* out) {
     const int side = 2 * radius + 3, plane = side * side, reach = 2 * radius, stride = team.layout.stride();
@@ -54,7 +54,7 @@ void write_cost_to_go(const TeamFacts& team, int radius, int num_planes, T*, T* 
     }
 }
 
-// Where another robot's goal lies.
+// The goals of other robots.
 template <class T>
 void write_other_goals(const TeamFacts& team, int radius, int num_planes, T* marks, T* out) {
     mark(team.layout, team.goals, team.num_agents, T{1}, marks);
@@ -62,7 +62,7 @@ void write_other_goals(const TeamFacts& team, int radius, int num_planes, T* mar
     mark(team.layout, team.goals, team.num_agents, T{0}, marks);
 }
 
-// Where robots stood one step before.
+// The positions of robots one step before.
 template <class T>
 void write_previous_positions(const TeamFacts& team, int radius, int num_planes, T* marks, T* out) {
     const auto steps = team.layout.steps();
@@ -101,7 +101,7 @@ void write_greedy_cells(const TeamFacts& team, int radius, int num_planes, T* ma
     }
 }
 
-// Where a robot, oneself included, stands on its goal.
+// The robots on their goals, this robot included.
 template <class T>
 void write_robots_on_goals(const TeamFacts& team, int radius, int num_planes, T* marks, T* out) {
     const auto mark_all = [&](T value) {

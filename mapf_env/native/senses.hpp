@@ -1,4 +1,4 @@
-// What robots sense beyond the paper's three channels. Every channel of the views, feature of a robot and feature of an
+// Perception beyond the paper's three channels. Every channel of the views, feature of a robot and feature of an
 // edge is declared once, by a row of a table in senses.cpp.
 #pragma once
 
@@ -13,7 +13,7 @@
 
 namespace mapf {
 
-// How many of its last moves a robot remembers.
+// Number of last moves that a robot remembers.
 inline constexpr int history = 16;
 
 // One team at one moment, as the kernels read it.

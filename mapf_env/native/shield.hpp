@@ -26,7 +26,7 @@ private:
 
 // Brings the paper's shield to its fixed point: moves off the map, into obstacles and swaps become idle; of several
 // robots that enter a cell one goes, drawn by `key`; nobody enters the cell of a robot that stays. What remains never
-// collides, and a joint action without conflicts passes unchanged. `blocked` is the map in its layout, pad >= 1.
+// collides, and a joint action without conflicts passes unchanged. `blocked` is the map in its layout, border >= 1.
 template <class T>
 void shield(const Layout& layout, const T* blocked, const std::int32_t* positions, const std::int64_t* actions,
             int num_agents, std::uint64_t key, ShieldScratch& scratch, std::int8_t* executed) {

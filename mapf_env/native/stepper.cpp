@@ -37,7 +37,7 @@ int process() {
 #endif
 }
 
-// Where observations go: the arrays of a `mapf_env.Observation`; those without columns are not read.
+// Output arrays for observations: those of a `mapf_env.Observation`; those without columns are not read.
 template <class T>
 struct Room {
     InOut<T, 5> fov;            // (B, N, C, side, side)
@@ -46,7 +46,7 @@ struct Room {
     InOut<float, 4> edge_attr;  // (B, N, N, D)
 };
 
-// Where the observations of the only team of a batch and its action masks (N, 5) go.
+// Output arrays for the observations of a batch of one team and its action masks (N, 5).
 template <class T>
 struct Memory {
     Room<T> room;
@@ -83,16 +83,16 @@ class Stepper {
 public:
     Stepper(nb::object state, nb::handle config, int threads)
         : state_(std::move(state)), options_(options_of(config)), threads_(threads) {
-        const int pad = options_.senses.fov_radius;
+        const int border = options_.senses.fov_radius;
         const auto positions = array<std::int32_t, 3>("positions");
         const auto obstacles = array<T, 3>("obstacles");
         const std::size_t B = positions.shape(0), N = positions.shape(1);
         const int rows = static_cast<int>(obstacles.shape(1)), cols = static_cast<int>(obstacles.shape(2));
-        teams_.layout = {rows - 2 * pad, cols - 2 * pad, pad};
+        teams_.layout = {rows - 2 * border, cols - 2 * border, border};
         teams_.num_envs = B;
         teams_.num_agents = N;
         const std::size_t size = teams_.layout.size();
-        if (pad < 1 || rows <= 2 * pad || cols <= 2 * pad || threads < 1)
+        if (border < 1 || rows <= 2 * border || cols <= 2 * border || threads < 1)
             fail("the arrays of the teams do not fit together");
         teams_.obstacles = own<T>("obstacles", {B, rows * 1u, cols * 1u});
         teams_.positions = own<std::int32_t>("positions", {B, N, 2});
@@ -130,19 +130,19 @@ public:
         run({actions.data(), nullptr}, out, skip_ended);
     }
 
-    void step_by_values(In<float, 3> values, nb::handle out, bool skip_ended) {
+    void step_by_scores(In<float, 3> scores, nb::handle out, bool skip_ended) {
         const std::size_t B = teams_.num_envs, N = teams_.num_agents;
         if (!options_.pibt)
             fail("actions must have shape " + shown({B, N}) +
-                 "; values of all five actions need a shield other than \"idle\"");
-        if (values.shape(0) != B || values.shape(1) != N || values.shape(2) != num_actions)
-            fail("values of actions must have shape " + shown({B, N, num_actions}) + ", got " +
-                 shown({values.shape(0), values.shape(1), values.shape(2)}));
-        for (std::size_t i = 0; i < values.size(); ++i)
-            if (std::isnan(values.data()[i]))
+                 "; scores of all five actions need a shield other than \"idle\"");
+        if (scores.shape(0) != B || scores.shape(1) != N || scores.shape(2) != num_actions)
+            fail("scores of actions must have shape " + shown({B, N, num_actions}) + ", got " +
+                 shown({scores.shape(0), scores.shape(1), scores.shape(2)}));
+        for (std::size_t i = 0; i < scores.size(); ++i)
+            if (std::isnan(scores.data()[i]))
                 fail("a value of agent " + std::to_string(i / num_actions % N) + " in environment " +
                      std::to_string(i / num_actions / N) + " is not a number");
-        run({nullptr, values.data()}, out, skip_ended);
+        run({nullptr, scores.data()}, out, skip_ended);
     }
 
     // Writes what the teams perceive; with `chosen` (B) those teams only.
@@ -178,8 +178,8 @@ public:
 
     Memory<T> memory(nb::handle out, InOut<std::int8_t, 2> masks) const { return {room_of(out), std::move(masks)}; }
 
-    // What the last step brought to the only team, by agent, in dictionaries that are filled in place, and its action
-    // masks. Returns whether the episode has ended.
+    // Fills dictionaries by agent with the outcome of the last step of a batch of one team, and its action masks. Returns
+    // true if the episode has ended.
     bool outcome_by_agent(const Memory<T>& memory, nb::list agents, nb::dict rewards, nb::dict terminated,
                           nb::dict truncated, nb::dict infos) {
         const std::size_t N = teams_.num_agents;
@@ -217,7 +217,7 @@ public:
         return outcome_by_agent(memory, agents, rewards, terminated, truncated, infos);
     }
 
-    // Begins episodes of M chosen teams with the given cases; nothing is changed if one of them cannot begin.
+    // Begins episodes of M chosen teams on the given instances; nothing is changed if one of them cannot begin.
     void begin(In<std::int64_t, 1> chosen, In<std::uint64_t, 1> seeds, In<std::int32_t, 1> limits, In<bool, 3> grids,
                In<std::int32_t, 3> starts, In<std::int32_t, 3> goals, In<std::int32_t, 1> sizes) {
         const auto& layout = teams_.layout;
@@ -237,13 +237,14 @@ public:
                 for (const std::int32_t* cell : {starts.data() + i, goals.data() + i})
                     if (!layout.contains(cell[0], cell[1])) fail("a start or goal lies outside the map");
         }
-        std::vector<Case> cases;
+        std::vector<EpisodeStart> episodes;
         nb::gil_scoped_release release;
-        cases.reserve(M);
+        episodes.reserve(M);
         for (std::size_t k = 0; k < M; ++k)
-            cases.push_back(case_of(teams_, reinterpret_cast<const std::uint8_t*>(grids.data()) + k * height * width,
+            episodes.push_back(
+                prepare_episode(teams_, reinterpret_cast<const std::uint8_t*>(grids.data()) + k * height * width,
                                     starts.data() + 2 * N * k, goals.data() + 2 * N * k, sizes(k)));
-        for (std::size_t k = 0; k < M; ++k) begin_team(teams_, options_, chosen(k), seeds(k), limits(k), cases[k]);
+        for (std::size_t k = 0; k < M; ++k) begin_team(teams_, options_, chosen(k), seeds(k), limits(k), episodes[k]);
     }
 
     void write_action_masks() {
@@ -345,14 +346,14 @@ private:
         for_each(teams_.num_envs, [&](std::size_t b, int part) { job(b, scratch_[part]); });
     }
 
-    void run(Wishes wishes, nb::handle out, bool skip_ended) {
-        if (out.is_none()) return run(wishes, nullptr, skip_ended);
+    void run(JointAction wanted, nb::handle out, bool skip_ended) {
+        if (out.is_none()) return run(wanted, nullptr, skip_ended);
         const Room<T> room = room_of(out);
         const Percepts<T> percepts = percepts_of(room);
-        run(wishes, &percepts, skip_ended);
+        run(wanted, &percepts, skip_ended);
     }
 
-    void run(Wishes wishes, const Percepts<T>* percepts, bool skip_ended) {
+    void run(JointAction wanted, const Percepts<T>* percepts, bool skip_ended) {
         const std::size_t B = teams_.num_envs, N = teams_.num_agents;
         const auto ended = std::count(teams_.ended, teams_.ended + B, true);
         if (ended > 0 && !skip_ended)
@@ -369,7 +370,7 @@ private:
                 teams_.terminated[b] = teams_.truncated[b] = false;
                 return;
             }
-            step_team(teams_, options_, b, wishes, scratch);
+            step_team(teams_, options_, b, wanted, scratch);
             if (percepts != nullptr) perceive_into(b, scratch, *percepts);
         });
     }
@@ -391,8 +392,8 @@ void define(nb::module_& m, const char* name, const char* memory) {
         .def(nb::init<nb::object, nb::handle, int>(), "state"_a, "config"_a, "threads"_a)
         .def("step", &Stepper<T>::step, "actions"_a, "out"_a.none(), "skip_ended"_a,
              "Execute joint actions (B, N) under the shield and write what the robots perceive, unless out is None.")
-        .def("step_by_values", &Stepper<T>::step_by_values, "values"_a, "out"_a.none(), "skip_ended"_a,
-             "Execute by values of all five actions (B, N, 5), under a shield other than \"idle\".")
+        .def("step_by_scores", &Stepper<T>::step_by_scores, "scores"_a, "out"_a.none(), "skip_ended"_a,
+             "Execute by scores of all five actions (B, N, 5), under a shield other than \"idle\".")
         .def("observe", &Stepper<T>::observe, "out"_a, "chosen"_a.none(),
              "Write what the robots perceive, of all teams or of the chosen ones (B,).")
         .def("bag", &Stepper<T>::bag, "chosen"_a.none(),
@@ -407,7 +408,7 @@ void define(nb::module_& m, const char* name, const char* memory) {
              "Step the only team by actions by agent and fill the dictionaries; whether the episode has ended, or None "
              "if the actions cannot be read.")
         .def("begin", &Stepper<T>::begin, "chosen"_a, "seeds"_a, "limits"_a, "grids"_a, "starts"_a, "goals"_a, "sizes"_a,
-             "Begin episodes of the chosen environments (M,) with cases (M, ...), all of them or none.")
+             "Begin episodes of the chosen environments (M,) on instances (M, ...), all of them or none.")
         .def("write_action_masks", &Stepper<T>::write_action_masks, "Bring the state's action_mask (B, N, 5) up to date.");
 }
 

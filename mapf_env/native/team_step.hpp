@@ -1,4 +1,19 @@
 // One joint step of a team, from wanted actions to new observations, in one pass while its data are in the cache.
+//
+// The state of all teams lies in flat arrays, environments first (struct Teams). Robot i of team b has row b * N + i:
+//
+//     team 0          team 1          team 2
+//     r0 r1 r2 --     r0 r1 -- --     r0 r1 r2 r3        N = 4 rows for each team; "--" is a robot that is not there
+//
+// An episode is the calls
+//
+//     prepare_episode   checks what the team begins with and finds its distance tables, if any sense needs them
+//     begin_team        writes the start state
+//     step_team         shield, move, reward, record, end; in lifelong tasks new goals (the steps are named there)
+//     perceive          writes the views, the communication graph and the features of robots and links
+//
+// Invariants: the rows of different teams are disjoint, so threads step teams without locks; every random draw is a
+// function of the episode's seed, the time and the robot, so results do not depend on the number of threads.
 #pragma once
 
 #include <algorithm>
@@ -19,7 +34,7 @@
 
 namespace mapf {
 
-// What a robot earns in a step; the parts add up.
+// The reward of a robot in a step is the sum of the parts that apply.
 struct Rewards {
     float on_goal, off_goal, arrival, replaced, solved, closer;
 };
@@ -52,7 +67,7 @@ struct Teams {
     std::int64_t* times;            // (B)
     std::int32_t* max_cycles;       // (B) steps after which the episode is truncated
     bool *started, *ended;          // (B)
-    // What the last step brought.
+    // The outcome of the last step.
     float* rewards;                 // (B, N)
     bool *terminated, *truncated;   // (B)
     bool *replaced, *arrived, *on_goal;  // (B, N)
@@ -85,8 +100,8 @@ Grid grid_of(const Layout& layout, const T* obstacles) {
     return {layout, std::move(blocked)};
 }
 
-// What an episode begins with, and what it needs to know beforehand.
-struct Case {
+// The start of an episode: its instance and, if a sense needs them, its distance tables.
+struct EpisodeStart {
     const std::uint8_t* grid;             // (height, width)
     const std::int32_t *starts, *goals;   // (N, 2)
     int size;                             // robots that are there
@@ -95,9 +110,9 @@ struct Case {
 
 // Throws std::invalid_argument if a way is too long to be counted.
 template <class T>
-Case case_of(const Teams<T>& teams, const std::uint8_t* grid, const std::int32_t* starts, const std::int32_t* goals,
+EpisodeStart prepare_episode(const Teams<T>& teams, const std::uint8_t* grid, const std::int32_t* starts, const std::int32_t* goals,
                 int size) {
-    Case result{grid, starts, goals, size, {}};
+    EpisodeStart result{grid, starts, goals, size, {}};
     if (teams.distances == nullptr) return result;
     const auto& layout = teams.layout;
     std::vector<std::uint8_t> blocked(layout.size(), 1);
@@ -117,13 +132,13 @@ Case case_of(const Teams<T>& teams, const std::uint8_t* grid, const std::int32_t
 // Begins an episode of team b, which is truncated after `limit` steps.
 template <class T>
 void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, std::uint64_t seed, std::int32_t limit,
-                const Case& begun) {
+                const EpisodeStart& episode) {
     const auto& layout = teams.layout;
     const std::size_t N = teams.num_agents, first = b * N, size = layout.size();
     const std::size_t area = static_cast<std::size_t>(layout.height) * layout.width;
     T* obstacles = teams.obstacles + b * size;
     bool* grid = teams.grids + b * area;
-    for (std::size_t cell = 0; cell < area; ++cell) grid[cell] = begun.grid[cell] != 0;
+    for (std::size_t cell = 0; cell < area; ++cell) grid[cell] = episode.grid[cell] != 0;
     for (int row = 0; row < layout.height; ++row)
         std::transform(grid + row * layout.width, grid + (row + 1) * layout.width, obstacles + layout.cell(row, 0),
                        [](bool blocked) { return static_cast<T>(blocked); });
@@ -132,19 +147,19 @@ void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, st
         std::copy(regions.begin(), regions.end(), teams.regions + b * size);
     }
     if (teams.distances != nullptr)
-        std::copy(begun.distances.begin(), begun.distances.end(), teams.distances + first * size);
-    std::copy_n(begun.starts, 2 * N, teams.positions + 2 * first);
-    std::copy_n(begun.goals, 2 * N, teams.goals + 2 * first);
+        std::copy(episode.distances.begin(), episode.distances.end(), teams.distances + first * size);
+    std::copy_n(episode.starts, 2 * N, teams.positions + 2 * first);
+    std::copy_n(episode.goals, 2 * N, teams.goals + 2 * first);
     std::fill_n(teams.moves + first * history, N * history, std::int8_t{-1});
     for (std::size_t i = 0; i < N; ++i) {
-        const std::int32_t *start = begun.starts + 2 * i, *goal = begun.goals + 2 * i;
-        teams.on_goal[first + i] = static_cast<int>(i) < begun.size && start[0] == goal[0] && start[1] == goal[1];
+        const std::int32_t *start = episode.starts + 2 * i, *goal = episode.goals + 2 * i;
+        teams.on_goal[first + i] = static_cast<int>(i) < episode.size && start[0] == goal[0] && start[1] == goal[1];
     }
     std::fill_n(teams.under_way + first, N, 0);
     std::fill_n(teams.arrivals + first, N, 0);
-    teams.team_sizes[b] = begun.size;
+    teams.team_sizes[b] = episode.size;
     teams.seeds[b] = seed;
-    teams.comm_radius[b] = options.connected ? connecting_radius(begun.starts, begun.size, options.comm_radius)
+    teams.comm_radius[b] = options.connected ? connecting_radius(episode.starts, episode.size, options.comm_radius)
                                              : options.comm_radius;
     teams.times[b] = 0;
     teams.max_cycles[b] = limit;
@@ -152,7 +167,7 @@ void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, st
     teams.ended[b] = false;
 }
 
-// What team b knows, with its distances and greedy moves if a sense needs them.
+// The facts of team b that senses read, with distances and greedy moves if a sense needs them.
 template <class T>
 TeamFacts facts_of(const Teams<T>& teams, std::size_t b, bool needs_map, std::vector<std::uint8_t>& greedy) {
     const std::size_t first = b * teams.num_agents;
@@ -280,55 +295,69 @@ inline void remember(std::int8_t move, std::int8_t* moves) {
     }
 }
 
-// What team b wants: an action of each robot (N), or values of all five (N, 5).
-struct Wishes {
+// The wanted actions of all teams: one action each (B, N), or a score for each of the five (B, N, 5). The pointer to
+// the form that is not used is null.
+struct JointAction {
     const std::int64_t* actions;
-    const float* values;
+    const float* scores;
 };
 
-// Shields, moves and rewards team b; the wishes were checked before.
+// Step 1 with the shield "pibt" or "pibt_swap": every robot gets the best action of its preference order that the
+// robots of higher priority leave it.
 template <class T>
-void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wishes wishes, TeamScratch<T>& scratch) {
+void shield_by_pibt(const Teams<T>& teams, const Options& options, std::size_t b, JointAction wanted,
+                    TeamScratch<T>& scratch) {
     const auto& layout = teams.layout;
-    const std::size_t N = teams.num_agents, first = b * N;
+    const std::size_t first = b * teams.num_agents;
     const int n = teams.team_sizes[b];
     const T* obstacles = teams.obstacles + b * layout.size();
-    std::int32_t* positions = teams.positions + 2 * first;
-    std::int32_t* goals = teams.goals + 2 * first;
+    const std::int32_t *positions = teams.positions + 2 * first, *under_way = teams.under_way + first;
+    const std::uint64_t seed = teams.seeds[b], priorities = seed_for(Use::priorities, seed);
+    const std::uint64_t key = mix(seed_for(Use::preferences, seed), static_cast<std::uint64_t>(teams.times[b]));
+    std::uint8_t* preferences = scratch.pibt.preferences.data();
     std::int8_t* executed = scratch.executed.data();
-    const std::uint64_t seed = teams.seeds[b], time = teams.times[b];
-    bool* replaced = teams.replaced + first;
 
-    if (options.pibt) {
-        std::uint8_t* preferences = scratch.pibt.preferences.data();
-        const std::uint64_t key = mix(seed_for(Use::preferences, seed), time);
-        for (int i = 0; i < n; ++i)
-            if (wishes.values != nullptr)
-                prefer_values(wishes.values + (first + i) * num_actions, preferences + i * num_actions);
-            else
-                prefer_action(static_cast<int>(wishes.actions[first + i]), mix(key, i), preferences + i * num_actions);
-        const std::uint64_t priorities = seed_for(Use::priorities, seed);
-        if (options.swap) {
-            auto& cells = scratch.goal_cells;
-            for (int i = 0; i < n; ++i) cells[i] = layout.cell(goals[2 * i], goals[2 * i + 1]);
-            const TableSwaps swaps{std::span<const int>(cells.data(), n), [&](int robot) {
-                                       return teams.distances + (first + robot) * layout.size();
-                                   }};
-            pibt_shield(layout, obstacles, positions, teams.under_way + first, n, priorities, scratch.pibt, executed,
-                        swaps);
-        } else {
-            pibt_shield(layout, obstacles, positions, teams.under_way + first, n, priorities, scratch.pibt, executed);
-        }
-        for (int i = 0; i < n; ++i) replaced[i] = executed[i] != preferences[i * num_actions];
+    for (int i = 0; i < n; ++i)
+        if (wanted.scores != nullptr)
+            prefer_scores(wanted.scores + (first + i) * num_actions, preferences + i * num_actions);
+        else
+            prefer_action(static_cast<int>(wanted.actions[first + i]), mix(key, i), preferences + i * num_actions);
+    if (options.swap) {
+        const std::int32_t* goals = teams.goals + 2 * first;
+        auto& cells = scratch.goal_cells;
+        for (int i = 0; i < n; ++i) cells[i] = layout.cell(goals[2 * i], goals[2 * i + 1]);
+        const TableSwaps swaps{std::span<const int>(cells.data(), n),
+                               [&](int robot) { return teams.distances + (first + robot) * layout.size(); }};
+        pibt_shield(layout, obstacles, positions, under_way, n, priorities, scratch.pibt, executed, swaps);
     } else {
-        shield(layout, obstacles, positions, wishes.actions + first, n, mix(seed_for(Use::ties, seed), time),
-               scratch.shield, executed);
-        for (int i = 0; i < n; ++i) replaced[i] = executed[i] != wishes.actions[first + i];
+        pibt_shield(layout, obstacles, positions, under_way, n, priorities, scratch.pibt, executed);
     }
+    for (int i = 0; i < n; ++i) teams.replaced[first + i] = executed[i] != preferences[i * num_actions];
+}
 
-    const Rewards& scheme = options.rewards;
+// Step 1 with the shield "idle": wanted actions that would collide become idle.
+template <class T>
+void shield_by_idling(const Teams<T>& teams, std::size_t b, JointAction wanted, TeamScratch<T>& scratch) {
+    const std::size_t first = b * teams.num_agents;
+    const int n = teams.team_sizes[b];
+    const std::uint64_t ties = seed_for(Use::ties, teams.seeds[b]), time = teams.times[b];
+    std::int8_t* executed = scratch.executed.data();
+    const T* obstacles = teams.obstacles + b * teams.layout.size();
+    shield(teams.layout, obstacles, teams.positions + 2 * first, wanted.actions + first, n, mix(ties, time),
+           scratch.shield, executed);
+    for (int i = 0; i < n; ++i) teams.replaced[first + i] = executed[i] != wanted.actions[first + i];
+}
+
+// Step 2: moves the robots, sets on_goal and arrived, and begins the rewards. Returns true if all are on their goals.
+template <class T>
+bool move_robots(const Teams<T>& teams, const Rewards& scheme, std::size_t b, const std::int8_t* executed) {
+    const std::size_t first = b * teams.num_agents;
+    const int n = teams.team_sizes[b];
+    std::int32_t* positions = teams.positions + 2 * first;
+    const std::int32_t* goals = teams.goals + 2 * first;
     float* rewards = teams.rewards + first;
     bool *on_goal = teams.on_goal + first, *arrived = teams.arrived + first;
+    const bool* replaced = teams.replaced + first;
     bool all_on_goal = true;
     for (int i = 0; i < n; ++i) {
         const int row = positions[2 * i], col = positions[2 * i + 1];
@@ -345,23 +374,46 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
         rewards[i] = (is_there ? scheme.on_goal : scheme.off_goal) + (arrives ? scheme.arrival : 0.0f) +
                      (replaced[i] ? scheme.replaced : 0.0f);
     }
+    return all_on_goal;
+}
+
+// Step 3: counts arrivals and the steps under way, and puts the executed moves into the robots' histories.
+template <class T>
+void record_moves(const Teams<T>& teams, std::size_t b, const std::int8_t* executed) {
+    const std::size_t first = b * teams.num_agents;
+    const int n = teams.team_sizes[b];
     for (int i = 0; i < n; ++i) {
-        teams.arrivals[first + i] += arrived[i];
-        teams.under_way[first + i] = on_goal[i] ? 0 : teams.under_way[first + i] + 1;
+        teams.arrivals[first + i] += teams.arrived[first + i];
+        teams.under_way[first + i] = teams.on_goal[first + i] ? 0 : teams.under_way[first + i] + 1;
     }
     for (int i = 0; i < n; ++i) remember(executed[i], teams.moves + (first + i) * history);
-    if (scheme.closer != 0.0f) {
-        const auto steps = layout.steps();
-        const Distance* distance = teams.distances + first * layout.size();
-        for (int i = 0; i < n; ++i, distance += layout.size()) {
-            const int cell = layout.cell(positions[2 * i], positions[2 * i + 1]);
-            rewards[i] += scheme.closer * static_cast<float>(distance[cell - steps[executed[i]]] - distance[cell]);
-        }
+}
+
+// Step 4: adds the reward for every step by which the distance to the goal has become shorter.
+template <class T>
+void reward_progress(const Teams<T>& teams, float closer, std::size_t b, const std::int8_t* executed) {
+    const auto& layout = teams.layout;
+    const auto steps = layout.steps();
+    const std::size_t first = b * teams.num_agents;
+    const Distance* distance = teams.distances + first * layout.size();
+    for (std::size_t i = 0; i < static_cast<std::size_t>(teams.team_sizes[b]); ++i, distance += layout.size()) {
+        const int cell = layout.cell(teams.positions[2 * (first + i)], teams.positions[2 * (first + i) + 1]);
+        teams.rewards[first + i] += closer * static_cast<float>(distance[cell - steps[executed[i]]] - distance[cell]);
     }
-    if (const std::size_t missing = N - n; missing > 0) {
-        std::fill_n(teams.rewards + first + n, missing, 0.0f);
-        for (bool* flags : {teams.replaced, teams.arrived, teams.on_goal}) std::fill_n(flags + first + n, missing, false);
-    }
+}
+
+// Step 5: clears the outcome of robots that are not there.
+template <class T>
+void clear_absent(const Teams<T>& teams, std::size_t b) {
+    const std::size_t absent = b * teams.num_agents + teams.team_sizes[b], end = (b + 1) * teams.num_agents;
+    if (absent == end) return;
+    std::fill_n(teams.rewards + absent, end - absent, 0.0f);
+    for (bool* flags : {teams.replaced, teams.arrived, teams.on_goal}) std::fill_n(flags + absent, end - absent, false);
+}
+
+// Step 6: advances the time, and ends the episode if the team has solved it or its time is over.
+template <class T>
+void end_or_continue(const Teams<T>& teams, const Options& options, std::size_t b, bool all_on_goal) {
     teams.times[b] += 1;
     // The flags of 64 teams share a cache line, for which threads would contend: it is written only if one changes.
     const auto update = [](bool& flag, bool value) {
@@ -371,8 +423,30 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Wis
     update(teams.terminated[b], terminated);
     update(teams.truncated[b], !terminated && teams.times[b] >= teams.max_cycles[b]);
     update(teams.ended[b], terminated || teams.truncated[b]);
-    if (terminated)
-        for (int i = 0; i < n; ++i) teams.rewards[first + i] += scheme.solved;
+    if (!terminated) return;
+    float* rewards = teams.rewards + b * teams.num_agents;
+    for (int i = 0; i < teams.team_sizes[b]; ++i) rewards[i] += options.rewards.solved;
+}
+
+// Executes one joint action of team b, which the caller has checked:
+//
+//     wanted --shield--> executed --move--> positions --> rewards, arrivals, history --> ended? --> new goals
+//
+// Invariant: no two robots of a team share a cell, before and after; the shield alone sees to that, and no later step
+// changes an action.
+template <class T>
+void step_team(const Teams<T>& teams, const Options& options, std::size_t b, JointAction wanted,
+               TeamScratch<T>& scratch) {
+    const std::int8_t* executed = scratch.executed.data();
+    if (options.pibt)
+        shield_by_pibt(teams, options, b, wanted, scratch);
+    else
+        shield_by_idling(teams, b, wanted, scratch);
+    const bool all_on_goal = move_robots(teams, options.rewards, b, executed);
+    record_moves(teams, b, executed);
+    if (options.rewards.closer != 0.0f) reward_progress(teams, options.rewards.closer, b, executed);
+    clear_absent(teams, b);
+    end_or_continue(teams, options, b, all_on_goal);
     if (options.lifelong) give_goals(teams, b, scratch);
 }
 

@@ -1,4 +1,4 @@
-"""Laws of the PettingZoo view's own arguments: forms of observation, preferences, reused buffers, state, rendering."""
+"""The PettingZoo view's own arguments: forms of observation, preferences, reused buffers, state, rendering."""
 
 import copy
 import pickle
@@ -72,7 +72,7 @@ def test_preferences_are_executed_in_their_order() -> None:
     _, _, _, _, infos = env.step({"agent_0": [9, 0, 0, 8, 1]})  # up is a wall, so right
     assert env.positions.tolist() == [[0, 1]]
     assert infos["agent_0"]["replaced"]
-    with pytest.raises(ValueError, match="a value for each of the five moves"):
+    with pytest.raises(ValueError, match="a score for each of the five moves"):
         env.step({"agent_0": 3})
     with pytest.raises(ValueError, match='preferences over all five moves need shield="pibt" or'):
         parallel_env(preferences=True)

@@ -1,4 +1,4 @@
-"""Laws of what goes beyond the paper: each option against its definition, and all of them at once against the rules."""
+"""The options beyond the paper: each one against its definition, and all of them at once against the rules."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ from mapf_env.senses import channels, edge_features, robot_features
 
 
 def by_the_rules(env: BatchedEnv, moves: list[npt.NDArray[np.int8]], under_way: npt.NDArray[np.int32]) -> Observation:
-    """What the robots perceive, put together from the pure functions; `moves` are all moves so far, newest first."""
+    """Build the observation from the pure functions; `moves` are all moves so far, newest first."""
     config, positions, goals = env.config, env.positions, env.goals
     B, N = positions.shape[:2]
     maps = rules.bordered(env.grids, config.fov_radius, config.dtype)
@@ -84,18 +84,18 @@ def test_the_fused_step_is_the_rules_one_after_another(
         maps = rules.bordered(env.grids, config.fov_radius, config.dtype)
         wanted = generator.integers(0, 5, (num_envs, N))
         values = generator.normal(size=(num_envs, N, 5)).astype(np.float32)
-        by_values = config.shield != "idle" and time % 2 == 1
+        by_scores = config.shield != "idle" and time % 2 == 1
         times = np.full(num_envs, time)
         if config.shield == "idle":
             executed = rules.shield(maps, config.fov_radius, before, wanted, seeds, times)
         else:
-            asked = values if by_values else wanted
+            asked = values if by_scores else wanted
             swap: dict[str, Any] = {}
             if config.shield == "pibt_swap":
                 swap = {"goals": goals, "distances": rules.distance_tables(maps, config.fov_radius, goals)}
             executed = rules.pibt_shield(maps, config.fov_radius, before, asked, under_way, seeds, times, **swap)
-            wanted = values.argmax(-1) if by_values else wanted
-        step = env.step(values if by_values else wanted)
+            wanted = values.argmax(-1) if by_scores else wanted
+        step = env.step(values if by_scores else wanted)
         observation, moves = step.observation, [executed, *moves]
         after = rules.move(before, executed)
         assert (env.positions == after).all()
@@ -289,7 +289,7 @@ def pibt_alone(
     time: int = 0,
     goals: Sequence[oracles.Cell] | None = None,
 ) -> list[int]:
-    """What the PIBT shield executes for one team, with swaps if it has goals."""
+    """Return the actions that the PIBT shield executes for one team, with swaps if it has goals."""
     maps, positions = rules.bordered(grid[None], 2), np.array([team], np.int32)
     waits, seeds, times = np.array([under_way], np.int32), np.array([seed], np.uint64), np.array([time])
     if goals is None:
@@ -417,7 +417,7 @@ def test_new_goals_are_as_defined(
 
 
 def hits_of_new_goals(grid: npt.NDArray[np.bool_], draws: int) -> npt.NDArray[np.int_]:
-    """How often each cell is drawn by a robot in the first corner, which is its goal too."""
+    """Count the draws of each cell by a robot in the first corner, which is its goal too."""
     maps = rules.bordered(np.broadcast_to(grid, (draws, *grid.shape)), 1)
     start = np.zeros((draws, 1, 2), np.int32)
     arrived, counts = np.ones((draws, 1), np.bool_), np.ones((draws, 1), np.int32)
@@ -678,7 +678,7 @@ def test_observations_are_written_into_the_callers_memory() -> None:
     for wrong in (out._replace(fov=out.fov.astype(np.float64)), tuple(out)[:2], out.fov):
         with pytest.raises(TypeError, match="out must be an Observation of contiguous memory as buffers"):
             env.step([[4, 4, 4]] * 2, out=wrong)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    with pytest.raises(ValueError, match="a step without observation needs no memory"):
+    with pytest.raises(ValueError, match="a step without observation needs no arrays"):
         env.step([[4, 4, 4]] * 2, out=out, observe=False)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
@@ -728,13 +728,13 @@ def test_options_out_of_range_are_refused(settings: dict[str, Any], message: str
         BatchedEnv(1, **settings)
 
 
-def test_wrong_values_of_actions_are_refused() -> None:
+def test_wrong_scores_of_actions_are_refused() -> None:
     idle, pibt = BatchedEnv(1, num_agents=2), BatchedEnv(1, num_agents=2, shield="pibt")
     for env in (idle, pibt):
         env.reset(seed=0)
     with pytest.raises(ValueError, match='need a shield other than "idle"'):
         idle.step(np.zeros((1, 2, 5)))
-    with pytest.raises(ValueError, match=r"values of actions must have shape \(1, 2, 5\), got \(1, 2, 4\)"):
+    with pytest.raises(ValueError, match=r"scores of actions must have shape \(1, 2, 5\), got \(1, 2, 4\)"):
         pibt.step(np.zeros((1, 2, 4)))
     with pytest.raises(ValueError, match="a value of agent 1 in environment 0 is not a number"):
         pibt.step(np.array([[[0.0] * 5, [0.0, np.nan, 0, 0, 0]]]))

@@ -1,4 +1,4 @@
-"""Laws of motion and perception, each beside a slow judge in plain Python."""
+"""The rules of motion and perception, each compared with slow plain Python."""
 
 from itertools import combinations, permutations, product
 from typing import Any
@@ -258,7 +258,7 @@ def test_wrong_arguments_are_refused() -> None:
         rules.distance_tables(np.zeros((1, 4, 5), np.float32), 1, team)
     with pytest.raises(ValueError, match="positions must have shape"):
         rules.move(team, np.zeros((1, 3), np.int8))
-    with pytest.raises(ValueError, match="fov_radius must be at least 1"):
+    with pytest.raises(ValueError, match="border must be at least 1"):
         rules.bordered(np.zeros((1, 2, 3), bool), 0)
     with pytest.raises(ValueError, match="views are float32 or uint8, got float64"):
         rules.bordered(np.zeros((1, 2, 3), bool), 1, np.float64)

@@ -9,9 +9,9 @@
 
 #include "experts/native/ecbs.hpp"
 #include "experts/native/labels.hpp"
-#include "experts/native/lacam.hpp"
-#include "experts/native/pibt.hpp"
-#include "experts/native/prioritised.hpp"
+#include "experts/native/lazy_constraints.hpp"
+#include "experts/native/priority_inheritance.hpp"
+#include "experts/native/prioritised_planning.hpp"
 #include "experts/native/rolling_horizon.hpp"
 #include "mapf_env/native/random.hpp"
 
@@ -48,7 +48,7 @@ void require(bool condition, const char* what, const Plan& crowd) {
     std::abort();
 }
 
-// Whether all robots get home without a conflict.
+// Returns true if all robots reach their goals without a conflict.
 template <class ActionsOf>
 bool is_plan(const Crowd& crowd, const ActionsOf& actions_of) {
     auto cells = crowd.starts;

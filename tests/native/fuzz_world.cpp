@@ -95,20 +95,20 @@ void play(std::uint64_t seed) {
     teams.terminated = &terminated, teams.truncated = &truncated, teams.replaced = replaced.get();
     teams.arrived = arrived.get(), teams.on_goal = on_goal.get(), teams.action_mask = mask.data();
 
-    begin_team(teams, options, 0, seed, 1 + random.below(40), case_of(teams, drawn.data(), starts.data(), ends.data(), n));
+    begin_team(teams, options, 0, seed, 1 + random.below(40), prepare_episode(teams, drawn.data(), starts.data(), ends.data(), n));
     for (int i = 0; i < 2 * n; ++i) require(positions[i] == starts[i] && goals[i] == ends[i], "another case began", seed);
     for (std::size_t i = 0; i < area; ++i) require(cells_blocked[i] == (drawn[i] != 0), "another map", seed);
 
     TeamScratch<T> scratch(teams.layout, static_cast<int>(N));
     std::vector<std::int64_t> actions(N);
-    std::vector<float> values(N * num_actions);
+    std::vector<float> scores(N * num_actions);
     std::vector<int> standing;
     while (!ended) {
         for (auto& action : actions) action = random.below(num_actions);
-        for (auto& value : values) value = static_cast<float>(random.below(7));
-        const bool by_values = options.pibt && random.below(2);
+        for (auto& score : scores) score = static_cast<float>(random.below(7));
+        const bool by_scores = options.pibt && random.below(2);
         previous = positions;
-        step_team(teams, options, 0, {actions.data(), by_values ? values.data() : nullptr}, scratch);
+        step_team(teams, options, 0, {actions.data(), by_scores ? scores.data() : nullptr}, scratch);
         perceive(teams, options, 0, scratch, Percepts<T>{fov.data(), graph.data(), scalars.data(), edge_attr.data()});
         std::vector<Edge> edges;
         find_edges(teams.layout, positions.data(), n, comm_radius, weights, options.message_loss,
@@ -134,8 +134,8 @@ void play(std::uint64_t seed) {
 
 }  // namespace
 
-int main(int count, char** values) {
-    const double seconds = count > 1 ? std::atof(values[1]) : 10.0;
+int main(int count, char** arguments) {
+    const double seconds = count > 1 ? std::atof(arguments[1]) : 10.0;
     const auto began = std::chrono::steady_clock::now();
     std::uint64_t seed = 0;
     for (; std::chrono::duration<double>(std::chrono::steady_clock::now() - began).count() < seconds; ++seed)

@@ -1,4 +1,4 @@
-#include "experts/native/prioritised.hpp"
+#include "experts/native/prioritised_planning.hpp"
 
 #include <algorithm>
 #include <numeric>

@@ -1,4 +1,4 @@
-#include "experts/native/pibt.hpp"
+#include "experts/native/priority_inheritance.hpp"
 
 #include <algorithm>
 #include <array>

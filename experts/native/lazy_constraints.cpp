@@ -1,4 +1,4 @@
-#include "experts/native/lacam.hpp"
+#include "experts/native/lazy_constraints.hpp"
 
 #include <algorithm>
 #include <numeric>
@@ -11,7 +11,7 @@ namespace {
 constexpr int none = -1;
 constexpr std::size_t patience = 500, patience_a_step = 4;  // expansions of a turn: of any, and for the longest way
 
-// What a swap asks of distances that are found as far as they are asked for.
+// The distances that swaps compare; they are computed on demand.
 struct GuidanceSwaps {
     static constexpr bool on = true;
     std::span<const int> goals;
@@ -39,7 +39,7 @@ Lacam::Lacam(const Grid& grid, std::span<const int> starts, std::span<const int>
       preferences_(starts.size() * num_actions), actions_(starts.size()) {}
 
 Status Lacam::run(const Limits& limits, Budget& budget) {
-    if (!measure(forward_, budget)) return Status::time_limit;
+    if (!compute_distances(forward_, budget)) return Status::time_limit;
     while (true) {
         if (expansions_ >= turn_end_ && !begin_turn(budget)) return Status::time_limit;
         const auto others = generated() - tree_->nodes.size();
@@ -50,8 +50,8 @@ Status Lacam::run(const Limits& limits, Budget& budget) {
     }
 }
 
-// Finds the robots' distances; false if the budget was spent first.
-bool Lacam::measure(Direction& direction, Budget& budget) {
+// Computes the robots' distances; returns false if the budget was spent first.
+bool Lacam::compute_distances(Direction& direction, Budget& budget) {
     auto& guidance = direction.guidance;
     while (guidance.size() < num_robots_) {
         const auto robot = guidance.size();
@@ -63,25 +63,25 @@ bool Lacam::measure(Direction& direction, Budget& budget) {
     return true;
 }
 
-// Whose turn it is: the complete search goes on, then a probe begins, then one from the goals. False if the budget was
-// spent first.
+// Begins the next turn: of the complete search, then of a new probe, then of a new probe from the goals. Returns false if
+// the budget was spent first.
 bool Lacam::begin_turn(Budget& budget) {
     const auto round = turns_ / 3, who = turns_ % 3;
     auto& direction = who == 2 ? backward_ : forward_;
-    if (!measure(direction, budget)) return false;
+    if (!compute_distances(direction, budget)) return false;
     tree_ = who == 0 ? &complete_ : &probe_;
     if (who > 0) {
         dropped_ += probe_.nodes.size();
         probe_ = Tree(direction, mix(seed_, turns_));
     }
-    if (tree_->nodes.empty()) plant(who == 0);
+    if (tree_->nodes.empty()) add_root(who == 0);
     turn_end_ = expansions_ + luby(round + 1) * (patience + patience_a_step * longest_);
     ++turns_;
     return true;
 }
 
-// Makes the starts the root of the tree.
-void Lacam::plant(bool longest_first) {
+// Adds the starts to the tree as its root.
+void Lacam::add_root(bool longest_first) {
     const auto& [starts, goals, guidance] = *tree_->direction;
     std::vector<int> order(num_robots_);
     std::iota(order.begin(), order.end(), 0);
@@ -93,11 +93,11 @@ void Lacam::plant(bool longest_first) {
     tree_->open.push_back(add(none, std::move(order)));
 }
 
-// Goes on in the tree; nothing if the expansions have reached their limit.
+// Continues the current tree; returns nothing if the expansions have reached their limit.
 std::optional<Status> Lacam::search(std::size_t expansion_limit, std::size_t node_limit, Budget& budget) {
     auto& [direction, nodes, states, known, open, random, goal_node] = *tree_;
     while (!open.empty()) {
-        // Take the newest node of Open, which makes the search depth first.
+        // 1. The newest node of OPEN: the search is depth first.
         const int id = open.back();
         if (std::ranges::equal(state(*tree_, id), direction->goals)) {
             goal_node = id;
@@ -105,7 +105,7 @@ std::optional<Status> Lacam::search(std::size_t expansion_limit, std::size_t nod
         }
         if (budget.look()) return Status::time_limit;
         if (expansions_ >= expansion_limit) return std::nullopt;
-        // Low-level search: the next constraint of the node, whose children are put in the queue.
+        // 2. Low level: take the node's next constraint and append that constraint's children.
         auto& node = nodes[id];
         if (node.next_constraint == node.constraints.size()) {
             open.pop_back();
@@ -113,12 +113,12 @@ std::optional<Status> Lacam::search(std::size_t expansion_limit, std::size_t nod
         }
         const auto which = static_cast<int>(node.next_constraint++);
         const auto constraint = node.constraints[static_cast<std::size_t>(which)];
-        constrain(id, which);
-        // Configuration generator: PIBT under the constraint.
+        add_constraints(id, which);
+        // 3. Configuration generator: PIBT under the constraint.
         ++expansions_;
-        if (!make_successor(id, constraint)) continue;
-        // A configuration that is known comes to the top of Open again.
-        if (const int old = find(new_state_); old != none) {
+        if (!generate_successor(id, constraint)) continue;
+        // 4. A known configuration goes to the top of OPEN again; a new one becomes a node.
+        if (const int old = find_node(new_state_); old != none) {
             open.push_back(old);
             continue;
         }
@@ -139,15 +139,15 @@ int Lacam::add(int parent, std::vector<int> order) {
     return id;
 }
 
-int Lacam::find(std::span<const int> cells) const {
+int Lacam::find_node(std::span<const int> cells) const {
     const auto [begin, end] = tree_->known.equal_range(hash(cells));
     for (auto at = begin; at != end; ++at)
         if (std::ranges::equal(state(*tree_, at->second), cells)) return at->second;
     return none;
 }
 
-// Adds the constraints that say in addition where the next robot of the node's order goes.
-void Lacam::constrain(int id, int which) {
+// Appends the children of a constraint: one for each cell that the next robot of the node's order can move to.
+void Lacam::add_constraints(int id, int which) {
     auto& node = tree_->nodes[id];
     const int depth = node.constraints[static_cast<std::size_t>(which)].depth;
     if (depth == static_cast<int>(num_robots_)) return;
@@ -161,8 +161,9 @@ void Lacam::constrain(int id, int which) {
     }
 }
 
-// Writes the joint state that PIBT reaches from the node under the constraint to new_state_, if there is one.
-bool Lacam::make_successor(int id, const Constraint& constraint) {
+// Writes the configuration that PIBT generates from the node under the constraint to new_state_. Returns false if the
+// constraint is not feasible.
+bool Lacam::generate_successor(int id, const Constraint& constraint) {
     const auto steps = grid_.layout.steps();
     const auto& node = tree_->nodes[id];
     const auto cells = state(*tree_, id);
@@ -181,7 +182,7 @@ bool Lacam::make_successor(int id, const Constraint& constraint) {
     return true;
 }
 
-// All five actions, the closest to the goal first, equally good ones in random order.
+// Writes the five actions in order of preference: nearest to the goal first, ties in random order.
 void Lacam::prefer(int robot, int cell, std::uint8_t* preferences) {
     if (cell == tree_->direction->goals[robot]) {
         const int first = tree_->random.below(idle);

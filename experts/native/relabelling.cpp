@@ -1,4 +1,4 @@
-#include "experts/native/relabel.hpp"
+#include "experts/native/relabelling.hpp"
 
 #include <algorithm>
 #include <limits>

@@ -10,9 +10,9 @@ namespace mapf {
 
 // Open addressing; a slot counts only if it carries the stamp of the current use. References die on the next insertion.
 template <class Value>
-class CellTimeTable {
+class PairTable {
 public:
-    CellTimeTable() { resize(initial_bits); }
+    PairTable() { resize(initial_bits); }
 
     void clear() {
         used_ = 0;
