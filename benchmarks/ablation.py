@@ -1,9 +1,9 @@
-"""What makes a good expert, and what aggregation is worth: `python benchmarks/ablation.py labels` or `dagger`.
+"""Ablations of the expert's labels and of aggregation: `python benchmarks/ablation.py labels` or `dagger`.
 
 Each variant differs from the default in the settings that its name says, and is trained on the same maps for the same
-small number of gradient steps on one thread. A run that is finished is not repeated and one that was interrupted goes
-on where it stopped, so give the command again after an interruption. It writes a table, `labels.md` or `dagger.md`,
-and `dagger.png` into the folder of the runs. Seconds are CPU seconds, which others on the machine do not spoil.
+small number of gradient steps on one thread. Finished runs are not repeated and interrupted ones are resumed, so give
+the command again after an interruption. It writes a table, `labels.md` or `dagger.md`, and `dagger.png` into the folder
+of the runs. Seconds are CPU seconds, which do not depend on other processes.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ DAGGER: Variants = {
     "beta 0.8": {"beta_decay": 0.8},
 }
 CPU_MINUTES = 2.5
-"""Of a run, on one core of an Intel Xeon at 2.3 GHz; said before there is a finished run to go by."""
+"""Duration of a run on one core of an Intel Xeon at 2.3 GHz, shown until a run is finished."""
 
 improved_lacam = functools.partial(experts.lacam, w=1.05, time_limit=2e-3)
 
@@ -88,7 +88,7 @@ class Options:
     """Train the variants of one ablation, then write its table."""
 
     ablation: Annotated[Literal["labels", "dagger"], tyro.conf.Positional]
-    """Who teaches and how ties are broken, or what is aggregated and how it is weighed."""
+    """The ablation: experts and their tie-breaking, or kinds and weights of aggregation."""
     runs: Path = Path("runs/ablation")
     """The folder of all runs; both ablations share the default's."""
     seeds: int = 1
@@ -175,10 +175,10 @@ def config_of(options: Options, name: str, seed: int) -> TrainConfig:
 
 
 def outcome(options: Options, name: str, seed: int) -> dict[str, Any] | None:
-    """What came of a run, if it is finished.
+    """Return the outcome of a run, if it is finished.
 
     Raises:
-        FileExistsError: If it is one of other settings.
+        FileExistsError: If it is a run of other settings.
     """
     folder = run_folder(options.runs, name, seed)
     if not (folder / "outcome.json").exists():
@@ -189,7 +189,7 @@ def outcome(options: Options, name: str, seed: int) -> dict[str, Any] | None:
 
 
 def expected_minutes(options: Options, variants: Variants) -> float:
-    """Of one run: as long as the finished ones took."""
+    """Estimate the duration of one run from the finished ones."""
     taken = [
         result["all_seconds"] / 60
         for name in variants
@@ -206,7 +206,7 @@ def reference_set() -> ReferenceSet:
 
 
 class ExpertActor:
-    """Asks the expert again in every state and does what it says.
+    """Asks the expert again in every state and takes its moves.
 
     Args:
         labeller: Asks the expert.
@@ -233,7 +233,7 @@ class ExpertActor:
 
 
 def label_quality(runs: Path, console: Console) -> dict[str, dict[str, float]]:
-    """How good the labels of each variant are when they are followed from step to step."""
+    """Measure the labels of each variant when they are followed from step to step."""
     file = runs / "quality.json"
     known: dict[str, dict[str, float]] = json.loads(file.read_text()) if file.exists() else {}
     reference = reference_set()
@@ -315,7 +315,7 @@ def markdown(found: dict[tuple[str, int], dict[str, Any]], quality: dict[str, di
 
 
 def draw(found: dict[tuple[str, int], dict[str, Any]], path: Path) -> None:
-    """Validation success against CPU seconds of training, a line for each variant, the mean of its seeds."""
+    """Draw validation success against CPU seconds of training, a line for each variant, the mean of its seeds."""
     figure = Figure(figsize=(7.2, 4.4), layout="constrained")
     axes = figure.subplots()
     for name in dict.fromkeys(name for name, _ in found):

@@ -1,7 +1,7 @@
-"""Random joint actions by the million through the environment, every executed step audited by an independent judge.
+"""Random joint actions by the million through the environment, with an independent audit of every executed step.
 
-The judge looks at the positions before and after a step and shares no code with the environment. It exits with 1 if it
-finds a collision or any other fault.
+The audit reads the positions before and after a step and shares no code with the environment. The exit status is 1 if
+it finds a collision or any other fault.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Positions = npt.NDArray[np.integer]
 
 @dataclass(frozen=True)
 class Options:
-    """What to audit."""
+    """The options of the audit."""
 
     steps: int = 10_000_000
     """Agent-steps in all, shared out equally over the scenes."""
@@ -78,7 +78,7 @@ SCENES = (
 
 @dataclass
 class Tally:
-    """What the judge counted in one scene."""
+    """The counts of the audit for one scene."""
 
     agent_steps: int = 0
     moves: int = 0
@@ -93,7 +93,7 @@ class Tally:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
 
-def judge(
+def audit_step(
     grids: npt.NDArray[np.bool_],
     before: Positions,
     wanted: npt.NDArray[np.integer],
@@ -103,8 +103,8 @@ def judge(
     """Audit one step of B teams on maps (B, H, W): positions (B, N, 2) before and after, wanted actions (B, N).
 
     Collisions are robots that share a cell afterwards and robots that exchanged cells. Other faults are steps off the
-    map or into obstacles, robots that neither stay nor go where they wanted, robots stopped without a reason, and
-    wrong reports of replaced actions.
+    map or into obstacles, robots that neither stay nor make the wanted move, robots stopped without a reason, and
+    wrong flags of replaced actions.
     """
     num_envs, height, width = grids.shape
     num_agents = before.shape[1]
@@ -113,7 +113,7 @@ def judge(
     as_wanted = (after[..., 0] == aim_row) & (after[..., 1] == aim_col)
 
     def cell(row: npt.NDArray[np.integer], col: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
-        """A number for each cell of each map, with a border of one cell, so that every aim has one."""
+        """A number for each cell of each map, with a border of one cell, so that every target has one."""
         maps = np.arange(num_envs)[:, None] * (height + 2) * (width + 2)
         return (maps + (row + 1) * (width + 2) + col + 1).ravel()
 
@@ -146,7 +146,7 @@ def judge(
 
 
 def audit(scene: Scene, steps: int, robots_at_once: int, seed: int) -> Iterator[Tally]:
-    """Play the scene for at least `steps` agent-steps and yield the judge's tally of each joint step."""
+    """Play the scene for at least `steps` agent-steps and yield the tally of each joint step."""
     num_envs = max(1, robots_at_once // scene.num_agents)
     env = BatchedEnv(
         num_envs,
@@ -165,7 +165,7 @@ def audit(scene: Scene, steps: int, robots_at_once: int, seed: int) -> Iterator[
         began = time.perf_counter()
         before, wanted = env.positions, generator.integers(0, IDLE + 1, (num_envs, scene.num_agents))
         step = env.step(wanted)
-        tally = judge(grids, before, wanted, env.positions, step.replaced)
+        tally = audit_step(grids, before, wanted, env.positions, step.replaced)
         ended = step.terminated | step.truncated
         if ended.any():
             env.reset(mask=ended)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 def calls_per_second(call: Callable[[], object], seconds: float) -> float:
-    """How often `call` runs in a CPU second; the clock, as slow as a short call, is read after every 16th."""
+    """Return the calls per CPU second; the clock, as slow as a short call, is read after every 16th call."""
     call()
     calls, began = 0, time.process_time()
     while time.process_time() - began < seconds:

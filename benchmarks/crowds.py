@@ -1,7 +1,7 @@
 """Solvers in crowds: `python benchmarks/crowds.py COMMAND`.
 
 `table`: first plans, improved plans and bounded plans of dense cases; `solve` solves a case only if it proves its plan.
-`limits`: plans that it returns without a proof, too. `labels`: states labelled a second. `plot`: success and cost
+`limits`: plans that it returns without a proof, too. `labels`: states labelled per second. `plot`: success and cost
 against time. One thread, except for `labels`.
 POGEMA's maps are read from `FOLDER/NAME/maps.yaml`; without the folder its rows are left out. For lifelong play, see
 `pogema.py --lifelong --methods rolling`.
@@ -201,7 +201,7 @@ def pogema_cases(folder: Path, name: str, num_agents: int, cases: int) -> list[I
 
 
 def chosen(options: argparse.Namespace, cases: Cases) -> Cases:
-    """The rows that were asked for."""
+    """Return the chosen rows."""
     words = options.rows
     return {name: each for name, each in cases.items() if words is None or any(name.startswith(w) for w in words)}
 

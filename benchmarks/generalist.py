@@ -5,7 +5,7 @@
 
 The maps are random, with the statistics of POGEMA's sets "random" and "mazes": 17 to 21 cells a side, 128 steps. A
 policy never trains on them, for they belong to the validation split. SoC is the sum of the last arrivals; a robot that
-is off its goal at the end counts all steps. Greedy robots under the PIBT shields are the rows that learn nothing.
+is off its goal at the end counts all steps. Greedy robots under the PIBT shields are the baselines.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Options:
     policy: Annotated[str, tyro.conf.Positional]
     """A run folder, a .safetensors file, or the name of a policy of the package."""
     executions: tuple[str, ...] = ()
-    """Ways to execute the policy, in the words of gnn_policy.evaluate; the policy's own if not given."""
+    """Executions of the policy, as in gnn_policy.evaluate; the policy's own if not given."""
     sets: tuple[str, ...] = tuple(SETS)
     """Kinds of maps."""
     sizes: tuple[int, ...] = (16, 32, 48, 64)
@@ -73,13 +73,13 @@ def instances_of(name: str, num_agents: int, cases: int) -> list[Instance]:
 
 
 def main(options: Options) -> None:
-    """Print success, ISR, SoC and the seconds that a step of one team takes in the batch."""
+    """Print success, ISR, SoC and the time of a step of one team in the batch."""
     torch.set_num_threads(1)
     policy = checkpoint.load(options.policy).eval()
     executions = [Execution.parse(row, policy.execution) for row in options.executions] or [policy.execution]
     actors: dict[str, Actor] = {each.name: PolicyActor(policy, each) for each in executions}
     actors |= {"PIBT": GreedyActor(shield="pibt"), "PIBT with swap": GreedyActor(shield="pibt_swap")}
-    table = Table("maps", "robots", "row", "success", "ISR", "SoC", "ms a step", title=options.policy)
+    table = Table("maps", "robots", "execution", "success", "ISR", "SoC", "ms per step", title=options.policy)
     for column in table.columns[1:]:
         column.justify = "right"
     jobs = [(name, size, row) for name in options.sets for size in options.sizes for row in actors]

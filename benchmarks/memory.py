@@ -58,7 +58,7 @@ def pettingzoo(steps: int) -> Callable[[], None]:
 
 
 def main() -> None:
-    """Play both and judge."""
+    """Play both and check the growth of memory."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=1_000_000, help="steps of a team, at least 640 (default: 10^6)")
     steps = parser.parse_args().steps

@@ -1,6 +1,6 @@
-"""The paper's experiment: train its models, test them on maps they never saw, draw its figures beside its numbers.
+"""The paper's experiment: train its models, test them on held-out maps, and draw its figures next to its numbers.
 
-    python benchmarks/paper.py          everything, going on from where it was stopped
+    python benchmarks/paper.py          everything; resumes after an interruption
     python benchmarks/paper.py plan     what is still to do, and how long that takes here
     python benchmarks/paper.py train    the models alone, one run folder of gnn_policy.train each
     python benchmarks/paper.py test     the finished models on the test maps
@@ -10,7 +10,7 @@ Figure 2 is success and flowtime increase of models tested on teams of the size 
 3; figure 3 tests every model with K = 3 on every size, and the one of 12 robots that does not communicate. All models
 see equally many robot states. Beyond the paper there are models for teams whose radius grows until they are connected,
 and one that knows the map and is trained under the PIBT shield on denser maps. Each finished model
-and each tested pair is a file; whatever is there is not done again.
+and each tested pair is a file; existing files are kept.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from paper_experiment import Experiment, Model, Options, Scene, W
 from paper_figures import draw
 
 STEPS = {20: 36, 50: 90}
-"""How long a team is under way on a map of this side, about; to say how long the tests take."""
+"""Approximate steps of an episode on a map of this side, to estimate the duration of the tests."""
 
 
 def plan(experiment: Experiment, console: Console) -> None:
-    """Say what is to do and how long it takes on this machine."""
+    """Print the remaining work and its duration on this machine."""
     torch.set_num_threads(experiment.threads)
     policies, untrained = _policies(experiment), experiment.untrained()
     untested = [
@@ -112,7 +112,7 @@ def test(experiment: Experiment, console: Console) -> None:
 
 
 Policies = dict[Model, DecentralizedPolicy]
-"""Those of the experiment's models that are there."""
+"""The models of the experiment that exist."""
 
 
 def _policies(experiment: Experiment) -> Policies:
@@ -120,10 +120,10 @@ def _policies(experiment: Experiment) -> Policies:
 
 
 def _untested(experiment: Experiment, policies: Policies) -> Iterator[tuple[Scene, Model | None]]:
-    """Where baselines (None) and models are still to be played.
+    """Return the scenes on which baselines (None) and models are still to be played.
 
     Raises:
-        FileExistsError: If there are results of other settings.
+        FileExistsError: If existing results have other settings.
     """
     for scene, model in [*((scene, None) for scene in experiment.scenes), *experiment.pairs()]:
         path = experiment.result(scene, _name(model))
@@ -134,7 +134,7 @@ def _untested(experiment: Experiment, policies: Policies) -> Iterator[tuple[Scen
 
 
 def _settings(experiment: Experiment, scene: Scene, model: Model | None, policies: Policies) -> dict[str, object]:
-    """All that a result depends on but the scene; the baselines play no policy."""
+    """Return everything that a result depends on except for the scene; baselines have no policy."""
     settings: dict[str, object] = {
         "cases_per_map": experiment.cases_per_map(scene),
         "w": W,
@@ -168,7 +168,7 @@ def _reference_set(experiment: Experiment, scene: Scene) -> metrics.ReferenceSet
 def _play(
     experiment: Experiment, scene: Scene, model: Model, policy: DecentralizedPolicy, reference: metrics.ReferenceSet
 ) -> tuple[list[metrics.Score], dict[str, dict[Failure, int]]]:
-    """A row for each way to execute the model, and how its teams failed."""
+    """Return a row for each execution of the model, and the failures of its teams."""
     rows, failures = [], {}
     for execution in experiment.executions(model, model.trained_for(scene)):
         with autocast(experiment.options.precision, torch.device("cpu")):
@@ -179,7 +179,7 @@ def _play(
 
 
 def _training_seconds(model: Model) -> float:
-    """What the gradient steps of a training take here, and two fifths more for all else."""
+    """Estimate the duration of a training: its gradient steps, and two fifths more for everything else."""
     config = model.config
     policy = DecentralizedPolicy(config.policy)
     optimizer = torch.optim.Adam(policy.parameters(), fused=True)
@@ -196,7 +196,7 @@ def _training_seconds(model: Model) -> float:
 
 
 def _test_seconds(experiment: Experiment, scene: Scene, model: Model) -> float:
-    """What the network's forward passes take here, and a quarter more for all else."""
+    """Estimate the duration of a test: the network's forward passes, and a quarter more for everything else."""
     policy = DecentralizedPolicy(model.config.policy).eval()
     bag = _bag(model.config.policy, 64, scene.num_agents)
     with torch.inference_mode(), autocast(experiment.options.precision, bag.fov.device):
@@ -213,7 +213,7 @@ def _bag(policy: PolicyConfig, teams: int, num_agents: int) -> Bag:
 
 
 def _seconds(action: Callable[[], object], times: int = 20) -> float:
-    """Of one call, after a warm-up."""
+    """Return the seconds of one call, after a warm-up."""
     action()
     began = time.perf_counter()
     for _ in range(times):

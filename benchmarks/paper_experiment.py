@@ -1,4 +1,4 @@
-"""What the paper's experiment consists of, and what of it is done: models, test cases, files."""
+"""The parts of the paper's experiment and their files: models, test cases, results."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LONGER = {
 }
 """The same of the paper's longer version (IROS 2020), with its online expert; quoted second-hand."""
 W = 1.05
-"""Of the expert whose makespans set T_max and whose flowtimes are compared with."""
+"""Suboptimality bound of the expert, whose makespans set T_max and whose flowtimes are the reference."""
 
 
 LARGE = tuple((50, N) for N in (20, 40, 60))
@@ -50,12 +50,12 @@ LARGEST = max(PAPER)
 
 @dataclass(frozen=True)
 class Options:
-    """Which part of the experiment to do, and how much of it."""
+    """The part of the experiment to do, and its size."""
 
     step: tyro.conf.Positional[Step] = "all"
-    """"plan" says what is to do and how long it takes; "train", "test", "draw" are the parts of "all"."""
+    """"plan" prints the remaining work and its duration; "train", "test", "draw" are the parts of "all"."""
     folder: Path = Path("runs/paper")
-    """Where models, results and figures go."""
+    """Folder for models, results and figures."""
     train_on: tuple[int, ...] = tuple(PAPER)
     """Sizes of the training teams."""
     taps: tuple[int, ...] = (3, 2, 1)
@@ -66,12 +66,12 @@ class Options:
     styles: tuple[MapStyle, ...] = ("cells", "walls")
     """Styles of the test maps, a table each."""
     rows: tuple[str, ...] = ("argmax", "stuck")
-    """How the policies are executed, as in gnn_policy.evaluate; the informed one under the PIBT shield, which it is
-    trained under."""
+    """Executions of the policies, as in gnn_policy.evaluate; the informed policy runs under the PIBT shield, as in its
+    training."""
     own_size_rows: tuple[str, ...] = ("sampled",)
-    """Further ways, for figure 2 alone: on teams of the size that a model was trained on."""
+    """Further executions for figure 2 alone, on teams of the size that a model was trained on."""
     packaged: bool = False
-    """Test the policies that come with the package, in place of those that were trained in the folder."""
+    """Test the policies that come with the package, instead of those that were trained in the folder."""
     cases_per_map: int = 50
     """Test cases on each of 90 maps."""
     large: bool = True
@@ -79,7 +79,7 @@ class Options:
     large_cases_per_map: int = 10
     """Test cases on each of them."""
     precision: Precision = "auto"
-    """In which numbers the policies compute in the tests, as in gnn_policy.train."""
+    """Number format of the policies in the tests, as in gnn_policy.train."""
     threads: int = 1
     """CPU threads of training, testing and the expert; 0 takes all that the process may use."""
     debug: bool = False
@@ -121,18 +121,18 @@ class Model:
 
     @property
     def exists(self) -> bool:
-        """Whether the experiment has it."""
+        """True if the experiment has this model."""
         least = {"paper": 1, "connected": 2, "informed": 3}[self.kind]
         return self.taps >= least and (self.kind == "paper" or self.num_agents == LARGEST)
 
     @property
     def general(self) -> bool:
-        """Whether it is tested on every size of the team."""
+        """True if the model is tested on teams of every size."""
         without_communication = self == Model(LARGEST, 1)
         return without_communication or (self.taps == 3 and self.kind != "connected")
 
     def trained_for(self, scene: Scene) -> bool:
-        """Whether the teams are of the size of its training."""
+        """True if the teams have the size of the model's training."""
         return scene.size == 20 and scene.num_agents == self.num_agents
 
 
@@ -169,7 +169,7 @@ class Experiment:
             self.scenes += [Scene(style, N, size) for style in options.styles for size, N in LARGE]
 
     def pairs(self) -> Iterator[tuple[Scene, Model]]:
-        """Which model is tested where."""
+        """Return the pairs of models and scenes to test."""
         for scene in self.scenes:
             for model in self.models:
                 large = model == Model(LARGEST, 3) and scene.size == 50
@@ -177,7 +177,7 @@ class Experiment:
                     yield scene, model
 
     def executions(self, model: Model, own_size: bool) -> list[Execution]:
-        """How a model is executed, on teams of the size it was trained on or of others."""
+        """Return the executions of a model, on teams of its training size or of other sizes."""
         names = (*self.options.rows, *(self.options.own_size_rows if own_size else ()))
         return [Execution.parse(name, Execution(shield=model.config.execution.shield)) for name in names]
 
@@ -186,7 +186,7 @@ class Experiment:
         return self.options.folder / model.name
 
     def policy_of(self, model: Model) -> Path | None:
-        """What `gnn_policy.load` reads of a model that can be tested."""
+        """Return the path of a model for `gnn_policy.load`."""
         if not self.options.packaged:
             return self.run_of(model) if self.is_trained(model) else None
         file = WEIGHTS / f"{model.name.replace('-k3', '')}.safetensors"
@@ -200,14 +200,16 @@ class Experiment:
         return [] if self.options.packaged else [each for each in self.models if not self.is_trained(each)]
 
     def is_trained(self, model: Model) -> bool:
-        """Whether its training has come to its end.
+        """Return True if the model's training is finished.
 
         Raises:
             FileExistsError: If the run folder holds a model of other settings.
         """
         metrics, config = (self.run_of(model) / name for name in ("metrics.csv", "config.toml"))
         if config.exists():
-            model.config.require_same_settings(TrainConfig.load(config), f"{self.run_of(model)} holds a model of", "--folder")
+            model.config.require_same_settings(
+                TrainConfig.load(config), f"{self.run_of(model)} holds a model of", "--folder"
+            )
         return metrics.exists() and len(metrics.read_text().splitlines()) == 1 + model.config.rounds
 
     def cases_per_map(self, scene: Scene) -> int:
@@ -219,7 +221,7 @@ class Experiment:
         return self.options.folder / "results" / scene.name / f"{player}.json"
 
     def row(self, scene: Scene, player: str, row: str) -> dict[str, Any] | None:
-        """What a player did there when executed in one way, if that is known."""
+        """Return the result of a player under one execution in a scene, if it exists."""
         path = self.result(scene, player)
         if not path.exists():
             return None

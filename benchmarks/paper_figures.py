@@ -1,4 +1,4 @@
-"""The paper's figures 2 and 3 beside its numbers, and tables of all that was tested."""
+"""The paper's figures 2 and 3 next to its numbers, and tables of all results."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def heat_map(
     *,
     signed: bool = False,
 ) -> None:
-    """A cell for each pair of training and test teams, white where there is no number; differences are signed."""
+    """Draw a cell for each pair of training and test teams, white where a number is missing; differences are signed."""
     colours, low, high = ("PuOr_r", -0.5, 0.5) if signed else ("viridis", 0.3, 1.0)
     axes.imshow(values, cmap=colours, vmin=low, vmax=high, aspect="auto")
     for i, j in np.argwhere(np.isfinite(values)):
@@ -123,7 +123,7 @@ def heat_map(
 
 
 def success_rates(experiment: Experiment, style: MapStyle, row: str) -> np.ndarray:
-    """(5, 6) of our models with K = 3, not a number where one is not tested."""
+    """Return (5, 6) success rates of our models with K = 3, NaN where one is not tested."""
     values = np.full((len(PAPER), len(TEAMS)), np.nan)
     for i, trained_on in enumerate(PAPER):
         for j, N in enumerate(TEAMS):
@@ -217,7 +217,7 @@ def _table(
 
 
 def _players(experiment: Experiment, baselines: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Who may have been tested on teams of any size: label, player and how it was executed; a star knows the map."""
+    """List the players and their executions: label, player, execution; a star knows the map."""
     models = [
         (f"{model.name}{'*' if model.config.policy.needs_map else ''} {execution.name}", model.name, execution.name)
         for model in experiment.models

@@ -61,16 +61,16 @@ class Options:
     methods: tuple[str, ...] = ("pibt", "n12-informed")
     """Methods: "pibt"; "pibt_swap"; "greedy"; "lacam", its first plan within two seconds, or "lacam,SECONDS", its
     plan improved for that long; "rolling", plans of a few steps, or "rolling,ROUNDS", improved for so many rounds; a
-    policy by its name, file or run folder, or with a row of gnn_policy.evaluate, as in "n12-informed,argmax" (executed
-    as its file says if no row is given)."""
+    policy by its name, file or run folder, or with an execution of gnn_policy.evaluate, as in "n12-informed,argmax"
+    (its own execution if none is given)."""
     cases: int | None = None
     """Cases to play of each set and team size, spread evenly over all; all of them if not given."""
     published: tuple[str, ...] = ()
     """Published methods to show; all of them if not given."""
     out: Path = Path("runs/pogema")
-    """Where results, tables and figures go."""
+    """Folder for results, tables and figures."""
     seed: int = 0
-    """Random seed of draws, of PIBT's order and of LaCAM."""
+    """Random seed for sampling, PIBT's order and LaCAM."""
     threads: int = 1
     """CPU threads of the network; 0 takes all that the process may use."""
 
@@ -98,7 +98,7 @@ def plan(options: Options) -> list[Cell]:
     Raises:
         ValueError: If an option or a file is wrong.
         OSError: If a file is missing.
-        FileExistsError: If there are results of other settings.
+        FileExistsError: If existing results have other settings.
     """
     if options.cases is not None and options.cases < 1:
         raise ValueError(f"--cases must be at least 1, got {options.cases}")
@@ -122,7 +122,7 @@ def plan(options: Options) -> list[Cell]:
 
 
 def _spread(cases: Sequence[Case], count: int | None) -> tuple[Case, ...]:
-    """That many of the cases, at equal distances; all if there are not more."""
+    """Return `count` of the cases, evenly spaced; all if there are not more."""
     if count is None or count >= len(cases):
         return tuple(cases)
     return tuple(cases[len(cases) * place // count] for place in range(count))

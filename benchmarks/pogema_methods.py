@@ -61,7 +61,7 @@ def method_named(words: str) -> Method:
 
     Raises:
         ValueError: If an option is unknown, or a policy is damaged.
-        OSError: If there is no such policy.
+        OSError: If the policy does not exist.
     """
     name, _, options = ("", "", "") if Path(words).exists() else words.partition(",")
     if name in SHIELDS and not options:
@@ -150,7 +150,7 @@ def _lacam(words: str, options: str) -> Method:
             each.starts[None] if result.solution is None else result.solution.paths
             for each, result in zip(instances, results, strict=True)
         ]
-        return judge(instances, plans, max_steps)
+        return outcomes_of(instances, plans, max_steps)
 
     return Method(words, {"w": str(w), "time_limit": seconds}, play, None)
 
@@ -181,7 +181,7 @@ def _rolling(words: str, options: str) -> Method:
             rollout(RollingActor(each, rounds, seed), [each], seed=seed, max_steps=max_steps).solutions[0].paths
             for each in instances
         ]
-        return judge(instances, trips, max_steps)
+        return outcomes_of(instances, trips, max_steps)
 
     def serve(instance: Instance, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
         return arrivals(instance, RollingActor(instance, rounds, seed), goals, steps, seed)
@@ -189,7 +189,7 @@ def _rolling(words: str, options: str) -> Method:
     return Method(words, {"rounds": rounds, "window": arguments.DEFAULT_WINDOW}, play, serve)
 
 
-def judge(instances: Sequence[Instance], paths: Sequence[npt.NDArray[np.integer]], max_steps: int) -> Played:
+def outcomes_of(instances: Sequence[Instance], paths: Sequence[npt.NDArray[np.integer]], max_steps: int) -> Played:
     """Apply the benchmark's rules to paths (T + 1, N, 2) of each team; what lies beyond `max_steps` is cut off.
 
     A team whose paths end earlier stays where it is.

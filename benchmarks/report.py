@@ -1,9 +1,9 @@
 """One page about training runs: `python benchmarks/report.py RUNS...`.
 
-Learning curves, success and flowtime against the number of robots beside the paper's, why teams failed with replays of
-examples, and tables of speed. The page is one file that needs no network. A run folder gives what it has: `metrics.csv`
-comes from training, `results.json` from `python -m gnn_policy.evaluate RUN --num-agents ... --failures K`, which leaves
-`failures.html` beside it.
+Learning curves, success and flowtime against the number of robots next to the paper's, failures with replays of
+examples, and tables of speed. The page is one file that works offline. Files that a run folder lacks are left out:
+`metrics.csv` comes from training, `results.json` from `python -m gnn_policy.evaluate RUN --num-agents ... --failures
+K`, which leaves `failures.html` next to it.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ class Options:
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders of `gnn_policy.train`, those of benchmarks/paper.py with what it tested on cells among them."""
     speed: tuple[Path, ...] = ()
-    """What benchmarks/speed.py, solvers.py or training.py printed, as text files."""
+    """Output of benchmarks/speed.py, solvers.py or training.py, as text files."""
     out: Path = Path("report.html")
-    """The page."""
+    """The page to write."""
     debug: bool = False
     """Print the traceback of an error."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a run folder holds."""
+    """The contents of a run folder."""
 
     name: str
     trained_on: int
@@ -69,7 +69,7 @@ class Run:
     results: dict[str, Any]
     """Tables by the number of robots; empty if the run was not evaluated."""
     tested_on: str
-    """What the tables were measured on."""
+    """The maps and cases of the tables."""
     failures: str | None
     """The page of the worst cases."""
 
@@ -78,10 +78,10 @@ class Run:
         """Read a run folder.
 
         Raises:
-            FileNotFoundError: If it is none.
+            FileNotFoundError: If it is not a run folder.
         """
         if not (folder / "config.toml").is_file():
-            raise FileNotFoundError(f"{folder} is no run folder of gnn_policy.train: it has no config.toml")
+            raise FileNotFoundError(f"{folder} is not a run folder of gnn_policy.train: it has no config.toml")
         metrics = folder / "metrics.csv"
         home = next((each for each in (folder / "evaluation", folder) if (each / "results.json").is_file()), None)
         page = (home or folder) / "failures.html"
@@ -100,7 +100,7 @@ class Run:
         )
 
     def rows(self) -> list[str]:
-        """The names of the ways in which the policy was executed."""
+        """The names of the executions of the policy."""
         return list(next(iter(self.results.values()))["failures"]) if self.results else []
 
     def estimates(self, row: str, measure: str) -> Iterator[tuple[int, float]]:
@@ -151,7 +151,7 @@ def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
             *(f"<p>{escape(who)}: {escape(tested_on)}</p>" for tested_on, who in tested_on.items()),
         ]
         parts += ["<h2>Success and flowtime against the number of robots</h2>", against_robots(evaluated)]
-        parts += ["<h2>Success beside the paper's</h2>", heat_maps(evaluated)]
+        parts += ["<h2>Success next to the paper's</h2>", heat_maps(evaluated)]
         kinds = "".join(f"<li><b>{kind}</b>: {meaning}</li>" for kind, meaning in MEANINGS.items())
         parts += ["<h2>Why teams failed</h2>", f"<ul>{kinds}</ul>", failures(evaluated)]
     for run in evaluated:
@@ -181,7 +181,7 @@ def curves(runs: Sequence[Run]) -> str:
 
 
 def against_robots(runs: Sequence[Run]) -> str:
-    """Every way of execution, with the paper's row of the same training teams."""
+    """Draw every execution, with the paper's row of the same training teams."""
     success, flowtime = axes(), axes()
     for run in runs:
         for row in run.rows():
@@ -198,7 +198,7 @@ def against_robots(runs: Sequence[Run]) -> str:
 
 
 def heat_maps(runs: Sequence[Run]) -> str:
-    """Success of the first way of execution, training teams by test teams, and the paper's."""
+    """Draw the success of the first execution, training teams by test teams, and the paper's."""
     ours = {run.name: dict(run.estimates(run.rows()[0], "success_rate")) for run in sorted(runs, key=by_size)}
     paper = {str(size): dict(zip(TEAMS, row, strict=True)) for size, row in PAPER.items()}
     columns = sorted({size for row in (*ours.values(), *paper.values()) for size in row})
@@ -216,7 +216,7 @@ def by_size(run: Run) -> tuple[int, str]:
 
 
 def failures(runs: Sequence[Run]) -> str:
-    """How many of the cases failed in which way, a diagram for each way of execution of each run."""
+    """Draw the failures by kind, a diagram for each execution of each run."""
     return side_by_side(*(failure_bars(run, row) for run in runs for row in run.rows()))
 
 
@@ -260,7 +260,7 @@ def side_by_side(*diagrams: Axes) -> str:
 
 
 def parse(arguments: Sequence[str]) -> Options:
-    """The command that the arguments ask for."""
+    """Return the command that the arguments ask for."""
     return tyro.cli(Options, args=arguments, prog="python benchmarks/report.py", description=__doc__)
 
 

@@ -1,4 +1,4 @@
-"""Solvers from PyPI beside ours: w9-pathfinding (optimal CBS) and pymapf (weighted CBS).
+"""Solvers from PyPI to compare with ours: w9-pathfinding (optimal CBS) and pymapf (weighted CBS).
 
 They live in a virtual environment of their own, in which this file runs as a script: problems in as JSON, results out.
 Swaps are forbidden, which w9-pathfinding does not do by itself; set-up is part of the time, as it is of ours.
@@ -26,7 +26,7 @@ Row = tuple[str, list[float], list[int | None]]
 
 
 def python() -> Path:
-    """The interpreter of the peers' environment, which is made if there is none.
+    """The interpreter of the peers' environment, which is made if it does not exist.
 
     Raises:
         subprocess.CalledProcessError: If they cannot be installed.

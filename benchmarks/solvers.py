@@ -1,7 +1,7 @@
-"""Time and quality of the teachers: `python benchmarks/solvers.py COMMAND`.
+"""Time and quality of the solvers: `python benchmarks/solvers.py COMMAND`.
 
-Every case is a fresh instance, the calls go round the instances in turn, and Python's share is included. One thread,
-but for `threads`.
+Every case is a fresh instance, the calls take the instances in turn, and Python's share is included. One thread,
+except for `threads`.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def many_robots(options: argparse.Namespace, console: Console) -> None:
 
 
 def peers(options: argparse.Namespace, console: Console) -> None:
-    """The packages w9-pathfinding and pymapf from PyPI beside ours, on the same instances."""
+    """The packages w9-pathfinding and pymapf from PyPI and ours, on the same instances."""
     table = Table("N", "solver", "median", "mean", "p95", "solved", "cost / ours, w=1", title="peers, ms")
     try:
         python = solver_peers.python()

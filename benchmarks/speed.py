@@ -1,9 +1,9 @@
-"""Agent-steps a CPU second on one thread, our environment beside POGEMA's in one run.
+"""Agent-steps per CPU second on one thread, our environment and POGEMA's in one run.
 
 Same team sizes, map size, density, radius of view and kind of actions (uniform, drawn beforehand); ours delivers the
-communication graph as well. A bare C++ loop that writes the same bytes says what this machine can do. The competitors
-take turns, so that a slower spell of the machine hits all. POGEMA lives in a virtual environment of its own, because it
-pins old packages; it is made on the first run.
+communication graph as well. A bare C++ loop that writes the same bytes shows the limit of the machine. The competitors
+take turns, so that slower periods of the machine affect all. POGEMA has its own virtual environment, because it
+pins old packages; it is created by the first run.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ DTYPES: tuple[Dtype, ...] = ("float32", "uint8")
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure."""
+    """The options of the measurement."""
 
     num_agents: tuple[int, ...] = (8, 32, 64)
     """Team sizes."""
     robots_at_once: int = 512
     """Robots in our batch: so many environments that their views stay in the cache."""
     rounds: int = 5
-    """How often the competitors take turns; medians are reported."""
+    """Number of turns of each competitor; medians are reported."""
     seconds: float = 0.4
     """CPU seconds of each measurement."""
     size: int = 20
@@ -60,7 +60,7 @@ class Options:
     fov_radius: int = 4
     """Cells seen in each direction (POGEMA's obs_radius)."""
     parts: tuple[Literal["peers", "threads"], ...] = ("peers", "threads")
-    """The tables to measure: everyone beside POGEMA and the bare loop; two threads and a large team."""
+    """The tables to measure: all environments with POGEMA and the bare loop; two threads and a large team."""
     pogema: bool = True
     """Measure POGEMA as well."""
 
@@ -96,7 +96,7 @@ class Competitor:
 
     name: str
     measure: Callable[[int], Rates]
-    beside: str
+    compared_with: str
     """The competitor of which it is a multiple."""
     bare: str = ""
     """The bare loop that writes the same bytes, of which it is a share."""
@@ -105,7 +105,7 @@ class Competitor:
 def batched(
     options: Options, dtype: Dtype = "float32", *, own_memory: bool = False, **settings: Any
 ) -> Callable[[int], Rates]:
-    """Our `BatchedEnv`, with fresh observations or in memory of the caller's own."""
+    """Our `BatchedEnv`, with new observations or in the caller's memory."""
 
     def measure(num_agents: int) -> Rates:
         num_envs = options.num_envs(num_agents)
@@ -152,11 +152,11 @@ def bare_loop(
 
 
 def compiled_bare_loop() -> Path:
-    """The program, compiled anew for this processor.
+    """Compile the program for this processor.
 
     Raises:
         CalledProcessError: If it does not compile.
-        OSError: If there is no compiler.
+        OSError: If a compiler is missing.
     """
     program = CACHE / "bare_loop"
     program.parent.mkdir(exist_ok=True)
@@ -167,7 +167,7 @@ def compiled_bare_loop() -> Path:
 
 
 def threads_table(options: Options, program: Path | None) -> Table:
-    """Two threads beside one, by wall-clock time, and a thousand robots on a large map beside the largest team.
+    """Compare two threads with one (wall-clock time), and a thousand robots on a large map with the largest team.
 
     The environments take turns of some milliseconds, and the best turn of each counts. Ratios have differed between
     runs of one commit: run it more than once.
@@ -213,7 +213,7 @@ def threads_table(options: Options, program: Path | None) -> Table:
         one, two = map(max, rates)
         result.add_row(f"{name}, N={largest}", f"{one:,.0f}", f"{two:,.0f}", f"{two / one:.2f}x")
     one, thousand = best(stepper(largest, options.num_envs(largest)), stepper(1000, 1, height=256, width=256))
-    result.add_row(f"N=1000 on 256x256 beside N={largest}", f"{thousand:,.0f}", "", f"{thousand / one:.2f}x")
+    result.add_row(f"N=1000 on 256x256 vs N={largest}", f"{thousand:,.0f}", "", f"{thousand / one:.2f}x")
     return result
 
 
@@ -232,7 +232,7 @@ def pogema(options: Options, interface: Literal["list", "pettingzoo"], python: P
 
 
 def competitors(options: Options, console: Console, program: Path | None) -> list[Competitor]:
-    """Who takes part; ours only, with a warning, if POGEMA cannot be installed."""
+    """Return the competitors; only ours, with a warning, if POGEMA cannot be installed."""
     peer, view = "POGEMA, list API", "POGEMA, PettingZoo"
     floats, ints = ("bare loop, float32", "bare loop, uint8") if program else ("", "")
     ours = [
@@ -285,7 +285,7 @@ def table(
     for one in everyone:
         cells: list[str] = []
         for num_agents in options.num_agents:
-            value, peer, bare = (median(name, num_agents) for name in (one.name, one.beside, one.bare))
+            value, peer, bare = (median(name, num_agents) for name in (one.name, one.compared_with, one.bare))
             cells += [f"{value:,.0f}", f"{value / peer:.1f}x" if peer else ""] if value else ["", ""]
             cells += [f"{value / bare:.2f}" if value and bare else ""] if shares else []
         if shares or not one.name.startswith("bare"):

@@ -1,13 +1,13 @@
-"""Where the time of training goes, and how fast it is with other encoders, precisions, threads and processes.
+"""The time of training by its parts, and its speed with other encoders, precisions, threads and processes.
 
     python benchmarks/training.py round       the parts of a round, one thread
     python benchmarks/training.py steps       gradient steps with each encoder, convolution and precision, one thread
     python benchmarks/training.py processes   gradient steps with threads, and with processes under torchrun
-    python benchmarks/training.py company     rounds next to no, one and two busy processes, and on one thread
+    python benchmarks/training.py company     rounds next to zero, one and two busy processes, and on one thread
 
-"Overhead" is all of a round that is neither the network nor the expert nor the environment: batches rebuilt from
+"Overhead" is the part of a round outside network, expert and environment: batches rebuilt from
 positions, TorchRL's collector and loss module, our own loops. The network's parts are timed by themselves before and
-after the rounds, on batches like theirs. Nothing else may run on the machine meanwhile.
+after the rounds, on batches like theirs. Run nothing else on the machine meanwhile.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ CPU = torch.device("cpu")
 
 
 def median_seconds(action: Callable[[], object], repeats: int = 5, times: int = 20) -> float:
-    """Of one call, after a warm-up."""
+    """Return the seconds of one call, after a warm-up."""
     action()
     taken = []
     for _ in range(repeats):
@@ -83,7 +83,7 @@ def environment(config: TrainConfig, teams: int) -> BatchedEnv:
 
 
 def perceived(config: TrainConfig, teams: int) -> Bag:
-    """What the robots of some teams perceive at their starts, as tensors."""
+    """Return the observations of some teams at their starts, as tensors."""
     return tensors(environment(config, teams).bag())
 
 
@@ -170,7 +170,7 @@ def parts_of_a_round() -> None:
 
 
 def speed_of_steps() -> None:
-    """Robot states a second of bare gradient steps."""
+    """Robot states per second of bare gradient steps."""
     torch.set_num_threads(1)
     precisions: tuple[Precision, ...] = ("float32", "bfloat16")
     for encoder in ENCODERS:
@@ -186,7 +186,7 @@ def speed_of_steps() -> None:
 
 
 def with_library_convolutions(policy: DecentralizedPolicy) -> None:
-    """Put PyTorch's own convolutions in place of ours."""
+    """Replace our convolutions by PyTorch's."""
     for name, module in list(policy.encoder.named_children()):
         if isinstance(module, StridedConvolution):
             channels, width = module.weight.shape[1], module.weight.shape[0]
@@ -194,7 +194,7 @@ def with_library_convolutions(policy: DecentralizedPolicy) -> None:
 
 
 def fitted(run: Path, processes: int, threads: int) -> float:
-    """Robot states a second in the gradient steps of the quick recipe's batch."""
+    """Robot states per second in the gradient steps of the quick recipe's batch."""
     settings = f"""
         --rounds 1 --updates-per-round {UPDATES} --train-maps 100 --validation-maps 1 --validation-cases-per-map 1
         --test-maps 1 --cases-per-map 1 --demonstration-steps 8192 --dagger-every 0

@@ -1,4 +1,4 @@
-"""The teachers: solvers that take an instance and give a solution."""
+"""Solvers that take an instance and return a solution."""
 
 from experts.ecbs import solve
 from experts.labels import PlanLabels, label_plans

@@ -1,4 +1,4 @@
-"""The arguments all solvers share, with their defaults, checked beside those of the world."""
+"""The arguments that all solvers share, with their defaults and checks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MAX_ROUNDS = 2**31 - 1
 
 
 def suboptimality(w: float) -> float:
-    """The factor `w` as a finite float of at least 1."""
+    """Return the factor `w` as a finite float of at least 1."""
     value = number(w, "w")
     if not (math.isfinite(value) and value >= 1):
         raise ValueError(f"w must be a finite number >= 1 (1 is optimal, 1.05 allows 5% above the optimum), got {w!r}")
@@ -47,13 +47,13 @@ def suboptimality(w: float) -> float:
 
 
 def improvement(w: float) -> float:
-    """LaCAM's factor `w`: as `suboptimality`, or `math.inf` for the first plan as it is."""
+    """Return LaCAM's factor `w`: as `suboptimality`, or `math.inf` for the first plan without improvement."""
     value = number(w, "w")
     return value if value == math.inf else suboptimality(value)
 
 
 def seconds(time_limit: float) -> float:
-    """A time limit in seconds, above 0 and possibly infinite."""
+    """Return a time limit in seconds, above 0 and possibly infinite."""
     value = number(time_limit, "time_limit")
     if not value > 0:
         raise ValueError(f"time_limit must be a number of seconds > 0 (math.inf for no limit), got {time_limit!r}")
@@ -61,7 +61,7 @@ def seconds(time_limit: float) -> float:
 
 
 def at_least_one(value: int, name: str, maximum: int = 2**63 - 1) -> int:
-    """An integer argument in 1..maximum."""
+    """Return an integer argument in 1..maximum."""
     found = integer(value, name)
     if not 1 <= found <= maximum:
         raise ValueError(f"{name} must be an integer in 1..{maximum}, got {value!r}")

@@ -22,12 +22,12 @@ error in the arguments or a file"""
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """One line on standard error instead of the whole usage."""
+        """Prints one line on standard error instead of the whole usage."""
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
 def main(arguments_given: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     options = _parser().parse_args(arguments_given)
     try:
         status = options.run(options)
@@ -47,7 +47,7 @@ def main(arguments_given: Sequence[str] | None = None) -> int:
 
 
 def _in_one_line(error: Exception) -> str:
-    """What went wrong; for errors that are not about the input with their kind, since their text alone says little."""
+    """Return the message of an error; errors that are not about the input also show their type."""
     text = " ".join(str(error).split())
     if isinstance(error, ValueError | TypeError | OSError):
         return text
@@ -73,7 +73,7 @@ def _parser() -> _Parser:
     solve.add_argument(
         "--w",
         type=float,
-        help="of ecbs: how much the cost may exceed the optimum, at least 1 "
+        help="for ecbs: bound on cost / optimum, at least 1 "
         f"(default: {arguments.DEFAULT_W}); of lacam: where improvement stops (default: its first plan)",
     )
     solve.add_argument(
@@ -88,7 +88,7 @@ def _parser() -> _Parser:
         type=int,
         default=arguments.DEFAULT_NODE_LIMIT,
         metavar="NODES",
-        help=f"of ecbs and lacam: nodes to generate at most (default: {arguments.DEFAULT_NODE_LIMIT})",
+        help=f"for ecbs and lacam: maximum number of nodes (default: {arguments.DEFAULT_NODE_LIMIT})",
     )
     solve.add_argument("--paths", metavar="OUT", help="write the paths to this file, a line for each robot")
     solve.add_argument("--animation", metavar="OUT.svg", help="write an animation of the plan to this file")
@@ -113,16 +113,16 @@ def _add_problem(parser: argparse.ArgumentParser, name: str) -> None:
     action = parser.add_argument(
         name,
         metavar="FILE",
-        help="a scenario (.scen), whose map is looked for beside it, a map (.map) for random robots, a set of "
+        help="a scenario (.scen), whose map is next to it, a map (.map) for random robots, a set of "
         "instances (.json), as mapf_env.save_instances writes it, or maps of POGEMA (.yaml)",
     )
     action.required = True
-    parser.add_argument("--map", metavar="FILE.map", help="the map of the scenario, if it lies elsewhere")
+    parser.add_argument("--map", metavar="FILE.map", help="the map of the scenario, if it is elsewhere")
     parser.add_argument(
         "--agents", type=int, metavar="N", help="the number of robots, the first of a file (default: all)"
     )
-    parser.add_argument("--index", type=int, metavar="I", help="which instance or map of a file, from 0 (default: 0)")
-    parser.add_argument("--seed", type=int, default=0, help="of random robots and of the solver (default: 0)")
+    parser.add_argument("--index", type=int, metavar="I", help="index of the instance or map (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of random robots and of the solver (default: 0)")
 
 
 def _load(file: str, options: argparse.Namespace, agents: int | None) -> Instance:

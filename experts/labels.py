@@ -48,11 +48,11 @@ def label_plans(
     threads: int = 1,
     seed: int = 0,
 ) -> PlanLabels:
-    """Solves each instance once and labels the states on the first steps of its plan with the plan's moves.
+    """Solve each instance once and label the states on the first steps of its plan with the plan's moves.
 
-    An instance is a state: `instance.at(positions)` makes one from where robots stand. Teams and maps may differ. Plans
-    are found by ECBS if a few expansions are enough, else by LaCAM, whose plan large neighbourhood search improves. No
-    clock decides, so equal arguments give equal labels, on any number of threads.
+    An instance is a state: `instance.at(positions)` makes one from the robots' positions. Teams and maps may differ.
+    Plans are found by ECBS if a few expansions are enough, else by LaCAM, whose plan large neighbourhood search
+    improves. There is no time limit, so equal arguments give equal labels, on any number of threads.
 
     Args:
         instances: The states to start from.
@@ -69,7 +69,7 @@ def label_plans(
     Raises:
         ValueError: If an argument is out of its range.
         TypeError: If an argument has the wrong type.
-        KeyboardInterrupt: At Ctrl-C.
+        KeyboardInterrupt: On Ctrl-C.
     """
     source, time, offsets, positions, actions, solved, costs, finders = _native.label_plans(
         [(each.grid, each.starts, each.goals) for each in arguments.each_of(instances, Instance, "instances")],

@@ -1,4 +1,4 @@
-"""LaCAM: plans for hundreds to thousands of robots, complete, quick, and better the longer it may take."""
+"""LaCAM: complete and fast planning for hundreds to thousands of robots, with anytime improvement."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ def lacam(
     node_limit: int = arguments.DEFAULT_NODE_LIMIT,
     seed: int = 0,
 ) -> Result:
-    """Finds a plan by lazy constraints addition search, and improves it if that is asked for.
+    """Find a plan by lazy constraints addition search, and improve it if `w` is given.
 
     Okumura 2023, "LaCAM: search-based algorithm for quick multi-agent pathfinding": a depth-first search over joint
     states whose successors PIBT with swap makes, complete because all constraints on a successor are tried in the end.
-    It takes turns with searches that begin again with other random choices, also from the goals. A plan is then
+    It takes turns with searches that restart with other random choices, also from the goals. A plan is then
     improved by large neighbourhood search (Li et al. 2021) until it costs at most `w` times the sum of the distances,
-    or time is up. This is not LaCAM*, whose plans become optimal in the end.
+    or the time limit is reached. This is not LaCAM*, whose plans become optimal in the end.
 
     Args:
         instance: The problem.
-        w: Where improvement stops, at least 1; by default the first plan is returned as it is.
+        w: Cost bound at which improvement stops, at least 1; by default the first plan is returned unchanged.
         time_limit: Seconds of wall-clock time, `math.inf` for none. A plan found earlier is returned.
-        node_limit: Joint states to generate at most, of about 8 bytes a robot; at most four times as many successors
+        node_limit: Joint states to generate at most, of about 8 bytes per robot; at most four times as many successors
             are tried, which matters where hardly any joint move is possible.
         seed: Draws the order of equally good moves and of constraints.
 
@@ -39,7 +39,7 @@ def lacam(
     Raises:
         ValueError: If an argument is out of its range.
         TypeError: If an argument has the wrong type.
-        KeyboardInterrupt: At Ctrl-C.
+        KeyboardInterrupt: On Ctrl-C.
     """
     arguments.instance_of(instance, Instance, "instance")
     parts = _native.lacam(

@@ -1,4 +1,4 @@
-"""Many instances: as a list, or as a stream that never holds more than a few at once; and solvers of your own."""
+"""Solving many instances, as a list or as a stream of bounded memory, with the package's solvers or your own."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from experts.result import Result
 from mapf_env.instance import Instance
 
 Solver = Callable[[Instance], Result]
-"""A function of an instance that returns a result. `Result.of` makes the results of your own; they are audited."""
+"""A function of an instance that returns a result; make yours with `Result.of`. Its plans are audited."""
 
 Progress = Callable[[int, int], None]
-"""Told after each result: how many instances are done, and how many of them are solved."""
+"""Called after each result with the number of instances done and of those solved."""
 
 SOLVER_NAMES = ("ecbs", "lacam", "prioritised", "pibt")
 
@@ -37,21 +37,21 @@ def solve_many(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Result]:
-    """Solves each instance as `solve` does, or by another solver, over `threads` threads.
+    """Solve each instance as `solve` does, or with another solver, over `threads` threads.
 
     Instances may differ in maps and numbers of robots. The limits are those of each instance, not of the call. The
-    results do not depend on the number of threads (but for time limits), and each is what the solver alone gives.
+    results do not depend on the number of threads (except for time limits); each is that of the solver called alone.
 
     Args:
         instances: The problems.
-        solver: `"ecbs"`, `"lacam"`, `"prioritised"`, `"pibt"`, or a function of an instance, as `functools.partial`
-            makes one that fixes more options; its plans are `audited`.
+        solver: `"ecbs"`, `"lacam"`, `"prioritised"`, `"pibt"`, or a function of an instance, for
+            example a `functools.partial` that sets more options; its plans are `audited`.
         w: As in `solve` for `"ecbs"` and as in `lacam` for `"lacam"`, with the default of each; others have none.
         threads: Native solvers do not hold Python's interpreter lock. A function runs in a pool of threads, or in the
             calling thread if there is one only.
-        time_limit: Seconds for each instance, where a named solver takes a limit.
-        node_limit: For each instance, where a named solver takes a limit.
-        seed: Of named solvers.
+        time_limit: Seconds for each instance, if the named solver has a limit.
+        node_limit: Nodes for each instance, if the named solver has a limit.
+        seed: Random seed of a named solver.
         progress: Called after each result with the number of instances done and of those solved; of ECBS, which shares
             threads better the more it is given at once, after every 64 or so.
 
@@ -63,8 +63,8 @@ def solve_many(
             returns paths that do not solve the instance.
         TypeError: If an argument has the wrong type, an element of `instances` is not an `Instance`, or a solver's
             answer is not a `Result`.
-        KeyboardInterrupt: At Ctrl-C, which stops ECBS, and any solver on one thread, at once. On more threads other
-            solvers begin no further instance, and those that are running go on in the background to their end.
+        KeyboardInterrupt: On Ctrl-C, which stops ECBS, and any solver on one thread, at once. On more threads other
+            solvers start no further instance, and running ones finish in the background.
     """
     problems = list(arguments.each_of(instances, Instance, "instances"))
     return list(
@@ -94,9 +94,9 @@ def solve_stream(
     backlog: int = arguments.DEFAULT_BACKLOG,
     progress: Progress | None = None,
 ) -> Iterator[Result]:
-    """Solves instances as they come: `solve_many` for more of them than fit into memory, or without an end.
+    """Solve instances as they come: `solve_many` for more instances than fit into memory, or for an endless stream.
 
-    No more than `backlog` instances are taken before their results are: whoever reads slowly slows the source down.
+    No more than `backlog` instances are taken before their results are read, so a slow reader slows the source down.
     Arguments are checked in this call, before the first result is asked for.
 
     Args:
@@ -140,7 +140,7 @@ def solve_stream(
 
 
 def audited(solver: Solver) -> Solver:
-    """Wrap a solver of your own so that each plan is checked before anybody uses it.
+    """Wrap a solver of your own so that each plan is checked before it is used.
 
     `solve_many` and `solve_stream` do this with every function that they are given.
 
@@ -174,7 +174,7 @@ def _audit(solver: Solver, instance: Instance) -> Result:
 
 
 def _name(solver: object) -> str:
-    """The module and name of a function or of the class of a callable object."""
+    """Return the module and name of a function or of the class of a callable object."""
     while isinstance(solver, partial):
         solver = solver.func
     named: Any = solver if hasattr(solver, "__qualname__") else type(solver)
@@ -182,10 +182,10 @@ def _name(solver: object) -> str:
 
 
 def solver_named(name: str, *, w: float | None, time_limit: float, node_limit: int, seed: int) -> Solver:
-    """The solver of that name with the limits it takes, and `w` if that is given.
+    """Return the solver of that name with the limits it takes, and `w` if that is given.
 
     Raises:
-        ValueError: If there is no such solver, or it has no `w` and one is given.
+        ValueError: If the solver is unknown, or it has no `w` and one is given.
     """
     match name:
         case "ecbs":

@@ -21,7 +21,7 @@ _AGENT = re.compile(r"agent\s*([0-9]{1,9})\s*:", re.IGNORECASE)
 _TIME = re.compile(r"([0-9]{1,9})\s*:")
 _CELL = re.compile(r"\(\s*([0-9]{1,9})\s*,\s*([0-9]{1,9})\s*\)\s*(?:->|,)?\s*")
 _MOST_CELLS = 1 << 27
-"""What a table of paths may hold, 1 GiB: a few long paths among many short ones would fill any memory."""
+"""Limit on the size of a table of paths, 1 GiB: a few long paths among many short ones could fill the memory."""
 
 
 def save_paths(path: PathLike, solution: Solution) -> None:
@@ -40,7 +40,7 @@ def save_paths(path: PathLike, solution: Solution) -> None:
 
 
 def load_paths(path: PathLike) -> Solution:
-    """Read a path file, or a log of LaCAM. `Solution.violations(instance)` tells whether the paths solve an instance.
+    """Read a path file, or a log of LaCAM. `Solution.violations(instance)` checks if the paths solve an instance.
 
     Raises:
         ValueError: If a line is damaged, a robot is missing, or a table of all cells would be too large; the message
@@ -78,7 +78,7 @@ def load_paths(path: PathLike) -> Solution:
 def _rows(
     path: PathLike, lines: Sequence[tuple[int, str]], beginning: re.Pattern[str], name: str, expected: str
 ) -> list[Cells]:
-    """The cells (T, 2) of each line, which the beginnings number from 0."""
+    """Return the cells (T, 2) of each line; the lines must be numbered from 0."""
     rows: list[Cells] = []
     for number, line in lines:
         match = beginning.match(line)

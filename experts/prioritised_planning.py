@@ -14,18 +14,18 @@ def prioritised(
     time_limit: float = arguments.DEFAULT_TIME_LIMIT,
     seed: int = 0,
 ) -> Result:
-    """Plans the robots in an order of priority, each along the shortest path that those before it leave.
+    """Plan the robots in an order of priority, each along the shortest path that the robots before it leave.
 
     Erdmann and Lozano-Perez 1987, "On multiple moving objects", over safe intervals (Phillips and Likhachev 2011,
-    "SIPP: safe interval path planning for dynamic environments"). The robots with the longest way come first; one that
-    finds no path comes first in the next order. Quick and often near the optimum, but without a bound, and some
-    instances have no order that works.
+    "SIPP: safe interval path planning for dynamic environments"). The robots with the longest distance come first; a
+    robot that finds no path comes first in the next order. Fast and often near the optimum, but without a bound, and
+    some instances have no order that works.
 
     Args:
         instance: The problem.
         max_orders: Orders to try at most; then the status is `node_limit`.
         time_limit: Seconds of wall-clock time, `math.inf` for none.
-        seed: Draws the order of robots whose ways are equally long.
+        seed: Random seed for the order of robots with equal distances.
 
     Returns:
         The result. Its lower bound is the sum of the distances, its expansions are the orders tried.
@@ -33,7 +33,7 @@ def prioritised(
     Raises:
         ValueError: If an argument is out of its range.
         TypeError: If an argument has the wrong type.
-        KeyboardInterrupt: At Ctrl-C.
+        KeyboardInterrupt: On Ctrl-C.
     """
     arguments.instance_of(instance, Instance, "instance")
     parts = _native.prioritised(

@@ -1,4 +1,4 @@
-"""DAgger's seam: what the expert would do next in each of many states."""
+"""Relabelling for DAgger: the expert's next joint action in each of many states."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def relabel(
     threads: int = 1,
     seed: int = 0,
 ) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
-    """The expert's first joint action in each of B states.
+    """Return the expert's first joint action in each of B states.
 
     For each state it is the first action of `solve(instance.at(positions[b]), w=w, node_limit=node_limit, seed=seed)`,
-    at a fraction of the time: the distance tables of an instance are computed once for all its states, also where the
+    at a fraction of the time: the distance tables of an instance are computed once for all its states, also if the
     same `Instance` object occurs many times in a sequence. There is no time limit, so labels are reproducible.
 
     Args:
@@ -48,7 +48,7 @@ def relabel(
         ValueError: If an argument is out of its range, shapes do not fit, or a state is invalid (off the map, on an
             obstacle, two robots in a cell, a goal out of reach); the message names the state and the robot.
         TypeError: If an argument has the wrong type.
-        KeyboardInterrupt: At Ctrl-C.
+        KeyboardInterrupt: On Ctrl-C.
     """
     flat, spans = _flat(positions, offsets)
     if isinstance(instances, Instance):
@@ -84,7 +84,7 @@ def relabel(
 def _flat(
     positions: npt.ArrayLike, offsets: npt.ArrayLike | None
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """The robots of all states (R, 2), and where each state begins and ends among them (B + 1,)."""
+    """Return the robots of all states (R, 2), and the offsets (B + 1,) of the states among them."""
     if offsets is None:
         states = arguments.cells(positions, "positions", "(B, N, 2)", ": N cells for each of B states")
         return states.reshape(-1, 2), np.arange(len(states) + 1) * states.shape[1]
@@ -96,7 +96,7 @@ def _flat(
 
 
 def _distinct(instances: list[Instance]) -> tuple[list[Instance], npt.NDArray[np.int64]]:
-    """The distinct objects among `instances`, and for each of `instances` its index among them."""
+    """Return the distinct objects among `instances`, and the index of each instance among them."""
     index_of: dict[int, int] = {}
     problems: list[Instance] = []
     problem_of = np.empty(len(instances), dtype=np.int64)

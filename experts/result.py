@@ -1,4 +1,4 @@
-"""What a solver answers: how its search ended, the plan that it found, and the lower bound that it proved."""
+"""Results of solvers: the status of the search, the plan found, and the lower bound proved."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mapf_env.solution import Solution
 
 
 class Status(StrEnum):
-    """How a search ended."""
+    """The outcome of a search."""
 
     SOLVED = "solved"
     NODE_LIMIT = "node_limit"
@@ -47,12 +47,12 @@ class Result:
 
     A solved result always has a solution, and that of `solve` is proved: `cost <= w * lower_bound`. A search that ends
     at its node or time limit may have one, too: the cheapest plan that it found. It has no conflicts, but it is not
-    proved to be within `w` of the optimum: `cost > w * lower_bound`. Results with another status have none. So ask
+    proved to be within `w` of the optimum: `cost > w * lower_bound`. Results with another status have none. Test
     `solved` for a proof, and `solution is not None` for a plan.
 
     Attributes:
-        status: How the search ended; `infeasible` is a proof that there is no solution.
-        solution: The paths, or None if there is no plan.
+        status: The outcome of the search; `infeasible` is a proof that no solution exists.
+        solution: The paths, or None without a plan.
         cost: The sum of costs of the solution in steps, or None without one.
         lower_bound: No solution costs less; proved by the search as far as it got.
         expansions: High-level nodes expanded (PIBT: joint steps; prioritised planning: orders tried).
@@ -98,7 +98,7 @@ class Result:
 
     @classmethod
     def of(cls, solution: Solution, *, lower_bound: int = 0, seconds: float = 0.0) -> Result:
-        """What a solver of your own answers: a solution, and the lower bound it has proved, if any.
+        """Make the result of your own solver: a solution, and the lower bound it has proved, if any.
 
         Raises:
             ValueError: If a number is negative, or the bound is above the cost.
@@ -123,7 +123,7 @@ Parts = tuple[int, npt.NDArray[np.int32] | None, int, int, int, int, float, int]
 
 
 def as_result(parts: Parts) -> Result:
-    """The result made of native parts."""
+    """Make a result from native parts."""
     status, paths, cost, lower_bound, expansions, generated, seconds, finder = parts
     solution = None if paths is None else Solution(paths)
     paid = None if paths is None else cost

@@ -1,4 +1,4 @@
-"""A planner for lifelong play: plans all robots a few steps ahead, and again after each step."""
+"""A planner for lifelong tasks: it plans all robots a few steps ahead, again after each step."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ class RollingHorizon:
     Rolling-horizon collision resolution (Li et al. 2021, "Lifelong multi-agent path finding in large-scale
     warehouses"): plans have `window` steps without a conflict, and after `execute` of them the robots plan again. PIBT
     with swap makes a first plan of each window, so there always is one; large neighbourhood search improves it (Jiang
-    et al. 2024, "Scaling lifelong multi-agent path finding to more realistic settings"). No clock decides, so equal
-    calls give equal moves.
+    et al. 2024, "Scaling lifelong multi-agent path finding to more realistic settings"). There is no time limit, so
+    equal calls give equal moves.
 
     Args:
         grid: The map (H, W), True on obstacles. Distances to goals are kept, two bytes for each cell and goal.
         window: Steps to plan ahead.
         execute: Steps to execute of each plan, at most `window`; 1 plans before every step.
-        rounds: Rounds of the neighbourhood search on each plan; more rounds bring more goals a step and take longer.
-        seed: Draws ties and neighbourhoods.
+        rounds: Rounds of the neighbourhood search on each plan; more rounds bring more arrivals per step and take
+            longer.
+        seed: Random seed for ties and neighbourhoods.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -50,12 +51,11 @@ class RollingHorizon:
     def act(self, positions: npt.ArrayLike, goals: npt.ArrayLike) -> npt.NDArray[np.int8]:
         """Return the next joint action.
 
-        Robots that are elsewhere than the last plan left them, a new episode among them, are planned from where they
-        are.
+        Robots that are not where the last plan left them, as in a new episode, are planned from their positions.
 
         Args:
             positions: (N, 2) integers, the row and column of each robot.
-            goals: (N, 2) integers, where each robot has to go now.
+            goals: (N, 2) integers, the current goal of each robot.
 
         Returns:
             (N,) int8, the `Action` of each robot. Together they have no conflict.
@@ -63,7 +63,7 @@ class RollingHorizon:
         Raises:
             ValueError: If shapes do not fit, or a robot or its goal is off the map, on an obstacle or out of reach.
             TypeError: If an array does not hold integers.
-            KeyboardInterrupt: At Ctrl-C.
+            KeyboardInterrupt: On Ctrl-C.
         """
         here = arguments.cells(positions, "positions", "(N, 2)")
         there = arguments.cells(goals, "goals", "(N, 2)")

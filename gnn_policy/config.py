@@ -122,7 +122,7 @@ class TrainConfig:
     rollout_teams: int = 128
     """Teams that are played at the same time."""
     backend: Backend = "direct"
-    """Where rollouts run: "direct" in this process, or "process" in as many other processes as `collectors`."""
+    """Process of the rollouts: "direct" for this one, "process" for as many others as `collectors`."""
     collectors: int = 1
     """Collectors that share the rollout_teams of one process; each has its own seed."""
     hard_case_mining: int = 1

@@ -53,9 +53,9 @@ def draw_learning_curve(rounds: Sequence[Round], path: Path) -> None:
     """Draw validation success, or throughput, and training loss against the robot states trained on, as PNG."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    judged = [row for row in rounds if row.validation is not None]
-    left.plot([row.samples / 1e6 for row in judged], [row.validation for row in judged], "o-", color="#1f6feb")
-    if any(row.validation_throughput is not None for row in judged):
+    validated = [row for row in rounds if row.validation is not None]
+    left.plot([row.samples / 1e6 for row in validated], [row.validation for row in validated], "o-", color="#1f6feb")
+    if any(row.validation_throughput is not None for row in validated):
         left.set(title="validation throughput", ylim=(0, None), ylabel="arrivals per step")
     else:
         left.set(title="validation success", ylim=(0, 1), ylabel="success rate")

@@ -62,7 +62,7 @@ class Ranks:
         return tensor
 
     def average_gradients(self, module: nn.Module) -> nn.Module:
-        """Wrap `module` so that its backward pass averages gradients; batch norm follows the statistics of process 0."""
+        """Wrap `module` to average gradients in its backward pass; batch norm follows the statistics of process 0."""
         return DistributedDataParallel(module) if self.count > 1 else module
 
 

@@ -154,7 +154,7 @@ def rollout(
     finally:
         if isinstance(policy, nn.Module):
             policy.train(was_training)
-    return _judge(
+    return _summarise(
         list(instances), [each or _Played.at_once(i) for each, i in zip(played, instances, strict=True)], limits, task
     )
 
@@ -284,7 +284,7 @@ def _play(
     ]
 
 
-def _judge(instances: list[Instance], played: list[_Played], limits: npt.NDArray[np.int64], task: Task) -> Rollouts:
+def _summarise(instances: list[Instance], played: list[_Played], limits: npt.NDArray[np.int64], task: Task) -> Rollouts:
     solutions = [Solution(each.paths) for each in played]
     success, flowtime, makespan, share, latched = [], [], [], [], []
     for run, solution, limit in zip(played, solutions, limits, strict=True):

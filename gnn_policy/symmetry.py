@@ -1,4 +1,4 @@
-"""The rotations and reflections of a grid world: one symmetry turns maps, positions and moves alike."""
+"""The rotations and reflections of a grid: one symmetry turns maps, positions and moves alike."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The world: instances, the rules of motion and perception, and the PettingZoo environment.
+"""Instances, the rules of motion and perception, and the PettingZoo environment.
 
 Importing it registers the environment as `mapf/grid-v0` with PettingZoo.
 """

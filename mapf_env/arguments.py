@@ -1,4 +1,4 @@
-"""The arguments of public calls, checked: each error says which one is wrong, what is allowed and what was given."""
+"""Checks of arguments to public calls: each error says which one is wrong, what is allowed and what was given."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ MOST_THREADS = 1024
 
 
 def instance_of(value: object, kind: type[T], name: str) -> T:
-    """`value`, which must be a `kind`."""
+    """Return `value`, which must be a `kind`."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be a {_public_name(kind)}, got {type(value).__name__}")
     return value
 
 
 def each_of(values: Iterable[T], kind: type[T], name: str) -> Iterator[T]:
-    """The values one by one, each of which must be a `kind`; that they can be gone through is checked at once."""
+    """Iterate over `values`, each of which must be a `kind`; that they are iterable is checked at once."""
     try:
         iterator = iter(values)
     except TypeError:
@@ -42,14 +42,14 @@ def choice(value: object, known: Sequence[str], name: str) -> None:
 
 
 def flag(value: object, name: str) -> bool:
-    """A bool, and nothing that is merely true or false."""
+    """Return `value`, which must be a bool."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} must be True or False, got {value!r}")
     return bool(value)
 
 
 def integer(value: object, name: str, least: int | None = None, most: int | None = None) -> int:
-    """An integer in least..most; True and False are none."""
+    """Return `value` as an integer in least..most; a bool is not an integer."""
     found = _as_int(value, name)
     if least is not None and found < least:
         raise ValueError(f"{name} must be at least {least}, got {found}")
@@ -59,7 +59,7 @@ def integer(value: object, name: str, least: int | None = None, most: int | None
 
 
 def seed(value: object, name: str = "seed") -> int:
-    """An integer in 0..2**64 - 1."""
+    """Return `value` as an integer in 0..2**64 - 1."""
     found = _as_int(value, name)
     if not 0 <= found < 2**64:
         raise ValueError(f"{name} must not be negative and fit into 64 bits, got {found}")
@@ -67,7 +67,7 @@ def seed(value: object, name: str = "seed") -> int:
 
 
 def number(value: object, name: str) -> float:
-    """A real number, which may be infinite or not a number; True and False are none."""
+    """Return `value` as a real number, which may be infinite or NaN; a bool is not a number."""
     if type(value) is float:  # before the slow question
         return value
     if isinstance(value, bool) or not isinstance(value, Real):
@@ -79,7 +79,7 @@ def number(value: object, name: str) -> float:
 
 
 def finite(value: object, name: str) -> float:
-    """A number that is neither infinite nor none."""
+    """Return `value` as a finite number."""
     found = number(value, name)
     if not np.isfinite(found):
         raise ValueError(f"{name} must be a finite number, got {found}")
@@ -87,7 +87,7 @@ def finite(value: object, name: str) -> float:
 
 
 def share(value: object, name: str) -> float:
-    """A number in [0, 1]."""
+    """Return `value` as a number in [0, 1]."""
     found = number(value, name)
     if not 0.0 <= found <= 1.0:
         raise ValueError(f"{name} must lie in [0, 1], got {found}")
@@ -95,7 +95,7 @@ def share(value: object, name: str) -> float:
 
 
 def array(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
-    """`values` as an array."""
+    """Return `values` as an array."""
     try:
         return np.asarray(values)
     except ValueError:
@@ -103,7 +103,7 @@ def array(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
 
 
 def numbers(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
-    """`values` as an array, which must not mix numbers with True and False; integers beyond 64 bits are cut off."""
+    """Return `values` as an array that does not mix numbers and bools; integers beyond 64 bits are clipped."""
     found = array(values, name)
     if found.dtype != np.bool_ and not isinstance(values, np.ndarray) and _holds_bool(values):
         raise TypeError(f"{name} must be numbers, got True or False among them")
@@ -119,9 +119,9 @@ def numbers(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
 def shaped(
     values: npt.ArrayLike, name: str, shape: str, meaning: str = "", *, filled: bool = False
 ) -> npt.NDArray[Any]:
-    """`values` as an array of that shape, for example "(B, N, 2)", of which letters stand for any length.
+    """Return `values` as an array of a shape such as "(B, N, 2)", in which letters stand for any length.
 
-    `meaning` is what the message says after the shape; `filled`, that no axis may have length 0.
+    The message ends with `meaning` after the shape; with `filled` no axis may have length 0.
     """
     found, wanted = array(values, name), _axes(shape)
     pairs = zip(wanted, found.shape, strict=False)
@@ -134,7 +134,7 @@ def shaped(
 def cells(
     values: npt.ArrayLike, name: str, shape: str, meaning: str = "", *, filled: bool = False
 ) -> npt.NDArray[np.int32]:
-    """A contiguous copy of rows and columns as int32; beyond 32 bits they lie off every map and are cut off there."""
+    """Return a contiguous copy of rows and columns as int32; values beyond 32 bits, off every map, are clipped."""
     found = shaped(numbers(values, name), name, shape, meaning, filled=filled)
     if found.dtype.kind not in "iu":
         raise TypeError(f"{name} must be integers, got dtype {found.dtype}")
@@ -144,7 +144,7 @@ def cells(
 
 @cache
 def _axes(shape: str) -> tuple[int | None, ...]:
-    """The lengths that a shape like "(B, N, 2)" asks for, None where any will do."""
+    """Return the lengths in a shape such as "(B, N, 2)", None where any length is allowed."""
     axes = [axis.strip() for axis in shape.strip("()").split(",") if axis]
     return tuple(int(axis) if axis.isdigit() else None for axis in axes)
 

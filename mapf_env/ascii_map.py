@@ -1,4 +1,4 @@
-"""Maps as they are drawn in text: one's own, in a test or a notebook."""
+"""Maps drawn as text, for tests, notebooks and your own maps."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from mapf_env.instance import Instance, Obstacles
 
 
 def parse_map(drawing: str) -> Obstacles:
-    """The grid (H, W) of a drawing: `#` or `@` is an obstacle, `.` or a letter a free cell.
+    """Return the grid (H, W) of a drawing: `#` or `@` is an obstacle, `.` or a letter a free cell.
 
-    Blank lines around the drawing and spaces at the ends of its lines are cut.
+    Blank lines around the drawing and spaces at the ends of its lines are ignored.
 
     Raises:
         ValueError: If there are no cells, the lines differ in length, or a cell is another character.
@@ -22,9 +22,10 @@ def parse_map(drawing: str) -> Obstacles:
 
 
 def parse_instance(drawing: str) -> Instance:
-    """The problem of a drawing: `A` to `Z` are robots, `a` to `z` their goals, `#` or `@` obstacles, `.` free cells.
+    """Return the instance of a drawing.
 
-    A robot whose goal is not drawn has it where it stands. Robots are numbered in the order of their letters.
+    `A` to `Z` are robots, `a` to `z` their goals, `#` or `@` obstacles, `.` free cells.
+    The goal of a robot without a drawn goal is its start. Robots are numbered in the order of their letters.
 
     Raises:
         ValueError: If a letter occurs twice, a goal has no robot, or the problem is ill formed.

@@ -26,7 +26,7 @@ class EnvConfig(Senses):
 
     Raises:
         ValueError: If a setting is out of its range, or the map has no room for the robots.
-        TypeError: If a number or a sequence of channels is none.
+        TypeError: If a setting has the wrong type.
     """
 
     num_agents: int = 10
@@ -38,17 +38,17 @@ class EnvConfig(Senses):
     density: float = 0.1
     """Share of obstacles on the random maps."""
     style: Style = "cells"
-    """Random maps of independent "cells", short "walls" as in the paper's released generator, or of a style that has no
-    density: "maze", "room", "warehouse", whose parts have sizes as `Maze`, `Rooms` or `Warehouse`, and "empty"."""
+    """Random maps of independent "cells", short "walls" as the authors' generator builds them, or a style without
+    density: "maze", "room", "warehouse", whose sizes `Maze`, `Rooms` or `Warehouse` set, and "empty"."""
     message_loss: float = 0.0
     """Probability that an edge of the communication graph fails in a step."""
     shield: Shield = "idle"
     """Collision shielding: "idle" is the paper's, "pibt" pushes robots aside by priority, and "pibt_swap" also lets two
-    robots change places in a corridor, which takes the map."""
+    robots change places in a corridor, which needs the map."""
     task: Task = "one_shot"
     """"lifelong": a robot on its goal gets a new one at the end of the step, and only max_cycles ends the episode."""
     reward: str | Rewards = "flowtime"
-    """A scheme of `mapf_env.SCHEMES`, or `Rewards` of one's own."""
+    """A scheme of `mapf_env.SCHEMES`, or your own `Rewards`."""
     max_cycles: int = 128
     """Steps after which an episode is truncated (T_max)."""
     dtype: Dtype = "float32"
@@ -88,12 +88,12 @@ class EnvConfig(Senses):
 
 
 def configured(settings: dict[str, Any], options: Iterable[str], grid: npt.ArrayLike | None) -> EnvConfig:
-    """The configuration of an environment by its keyword arguments.
+    """Return the configuration of an environment from its keyword arguments.
 
     Args:
         settings: Fields of `EnvConfig`.
-        options: The other keyword arguments of the environment, for the message.
-        grid: The map (H, W) that it has, if that is given; it sets the height and the width.
+        options: The other keyword arguments of the environment, which the message lists.
+        grid: The map (H, W) of the environment, if given; it sets the height and the width.
 
     Raises:
         TypeError: If a setting is unknown; the message lists those that exist.

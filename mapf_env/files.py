@@ -1,4 +1,4 @@
-"""Reading text from anywhere, and writing files so that a reader never sees half of one."""
+"""Reading text in any encoding, and writing files so that a reader never sees half of one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOST_LINKS = 40
 
 
 def as_path(path: PathLike, name: str = "path") -> Path:
-    """`path`, of which messages say `name`; raises TypeError where it is none."""
+    """Return `path`, which messages call `name`; raises TypeError if it is not a path."""
     if not isinstance(path, str | os.PathLike):
         raise TypeError(f"{name} must be a str or os.PathLike, got {type(path).__name__}")
     return Path(path)
@@ -45,7 +45,7 @@ def read_bytes(path: PathLike) -> bytes:
 def decoded(content: bytes) -> str:
     """Decode UTF-8, or UTF-16 that a byte order mark announces.
 
-    Byte order marks are left out, lines end with a line feed, and what cannot be decoded becomes U+FFFD.
+    Byte order marks are removed, lines end with a line feed, and bytes that cannot be decoded become U+FFFD.
     """
     marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     text = content.decode("utf-16" if marked else "utf-8", errors="replace")
@@ -53,7 +53,7 @@ def decoded(content: bytes) -> str:
 
 
 def read_text(path: PathLike) -> str:
-    """Read a text file as `decoded` does it.
+    """Read a text file with `decoded`.
 
     Raises:
         ValueError: If it holds more than 1 GiB.
@@ -64,13 +64,13 @@ def read_text(path: PathLike) -> str:
 
 @contextmanager
 def replacing(path: PathLike) -> Iterator[Path]:
-    """A draft to write, which replaces `path` once the block ends well: a crash leaves the old file or the new.
+    """Yield a draft that replaces `path` if the block ends without an error: a crash leaves the old file or the new.
 
-    Links are followed, and a replaced file leaves its mode, owner and attributes to the new one. What is no plain file
-    (a device, a pipe), or has a second name or another owner, keeps its identity: the draft is copied into it.
+    Links are followed, and the new file gets the mode, owner and attributes of the replaced one. A path that is not a
+    plain file (a device, a pipe), or has a second name or another owner, is not replaced: the draft is copied into it.
 
     Raises:
-        OSError: As `require_writable`, or if there is no room; the message names `path`.
+        OSError: As `require_writable`, or if the disk is full; the message names `path`.
     """
     target = require_writable(path)
     into = _must_stay(target)
@@ -107,7 +107,7 @@ def require_writable(path: PathLike) -> Path:
 
 
 def require_outputs(outputs: Iterable[PathLike | None], inputs: Iterable[PathLike | None]) -> None:
-    """Check before the work that a command can write its outputs, and that none of them overwrites another file of it.
+    """Check that a command can write its outputs, and that none of them overwrites another of its files.
 
     Raises:
         ValueError: If two outputs are one file, or an output is an input.
@@ -127,13 +127,13 @@ def require_outputs(outputs: Iterable[PathLike | None], inputs: Iterable[PathLik
 
 
 def unused(path: Path) -> Path:
-    """Return `path`, or if something has that name the first of `name-2`, `name-3`, ... that is free."""
+    """Return `path`, or if it exists the first of `name-2`, `name-3`, ... that does not."""
     names = (path if k == 1 else path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(1))
     return next(name for name in names if not os.path.lexists(name))
 
 
 def remove_drafts(folder: PathLike) -> None:
-    """Remove what writers that were killed left in `folder`."""
+    """Remove the drafts that killed writers left in `folder`."""
     for draft in Path(folder).glob(f"{_DRAFT}*"):
         if draft.is_dir() and not draft.is_symlink():
             shutil.rmtree(draft)
@@ -146,7 +146,7 @@ def write_whole(path: PathLike, text: str) -> None:
 
 
 def _followed(path: Path) -> Path:
-    """The end of a chain of symbolic links; a link of the system to an open file, as behind /dev/stdout, ends it."""
+    """Return the end of a chain of symbolic links; a system link to an open file, as behind /dev/stdout, ends it."""
     here = path
     for _ in range(_MOST_LINKS):
         here = Path(os.path.realpath(here.parent), here.name)

@@ -22,13 +22,13 @@ class Maze:
 
     Raises:
         ValueError: If a part is out of its range.
-        TypeError: If a number of cells is no integer.
+        TypeError: If a number of cells is not an integer.
     """
 
     corridor_width: int = 1
     """Cells, 1..9999."""
     loops: float = 0.1
-    """Share of the walls between two corridors that is opened beyond what connects them; 0 leaves one way anywhere."""
+    """Fraction of extra walls removed; 0 gives a perfect maze (one path between any two cells)."""
 
     def __post_init__(self) -> None:
         _check_parts(self)
@@ -48,9 +48,9 @@ class Walls:
     """
 
     segments: int = 2
-    """Steps of two cells that a wall grows, 1..9999; a step that meets another wall is left out."""
+    """Steps of two cells by which a wall grows, 1..9999; a step that meets another wall is skipped."""
     straight: float = 0.0
-    """Share of these steps that keep the direction of the step before; the others draw one of the four."""
+    """Share of these steps that keep the direction of the step before; the others take a random one of the four."""
     ring: bool = False
     """Keep the border of the map free, so that a corridor leads around it."""
 
@@ -66,7 +66,7 @@ class Rooms:
 
     Raises:
         ValueError: If the size is out of its range.
-        TypeError: If it is no integer.
+        TypeError: If it is not an integer.
     """
 
     room_size: int = 5
@@ -82,7 +82,7 @@ class Warehouse:
 
     Raises:
         ValueError: If a part is out of its range.
-        TypeError: If a number of cells is no integer.
+        TypeError: If a number of cells is not an integer.
     """
 
     shelf_length: int = 10
@@ -104,16 +104,16 @@ Seeds = npt.NDArray[np.uint64]
 def random_maps(
     seeds: npt.ArrayLike, *, height: int = 20, width: int = 20, density: float = 0.1, style: Style = "cells"
 ) -> Obstacles:
-    """Maps (B, H, W), True is an obstacle, one for each of B seeds; the free cells of a map are connected.
+    """Return random maps (B, H, W), True is an obstacle, one for each of B seeds; their free cells are connected.
 
     Args:
         seeds: (B,) unsigned integers.
         height: Rows H.
         width: Columns W.
         density: Share of obstacles; maps of the styles "cells" and "walls" have exactly round(density * H * W) of them,
-            the others as many as the style has.
+            the others as many as the style makes.
         style: "cells" blocks independent cells, "walls" builds short walls between cells with even coordinates as the
-            paper's released generator does, "empty" has no obstacles. "walls", "maze", "room" and "warehouse" are short
+            authors' generator does, "empty" has no obstacles. "walls", "maze", "room" and "warehouse" are short
             for `Walls()`, `Maze()`, `Rooms()` and `Warehouse()`, whose fields are the sizes of their parts.
 
     Raises:
@@ -129,7 +129,7 @@ def random_maps(
 def random_cases(
     seeds: npt.ArrayLike, grids: npt.NDArray[np.bool_], num_agents: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Starts and goals, each (B, N, 2), for each of B seeds on its grid of `grids` (B, H, W).
+    """Return starts and goals, each (B, N, 2), for each of B seeds on its grid of `grids` (B, H, W).
 
     Starts are distinct, goals are distinct, no robot starts on its own goal, and all lie in the largest connected free
     region, over which they are uniform.
@@ -146,7 +146,7 @@ def random_cases(
 def random_map(
     *, height: int = 20, width: int = 20, density: float = 0.1, style: Style = "cells", seed: int | None = None
 ) -> Obstacles:
-    """One map (H, W) as `random_maps` makes them; without a seed, a different one at each call."""
+    """Return one map (H, W) of `random_maps`; without a seed, a different one at each call."""
     return random_maps([_one_seed(seed)], height=height, width=width, density=density, style=style)[0]
 
 
@@ -160,7 +160,7 @@ def random_instance(
     grid: npt.ArrayLike | None = None,
     seed: int | None = None,
 ) -> Instance:
-    """A random instance, on a random map or on `grid` (H, W) if that is given.
+    """Return a random instance, on a random map or on `grid` (H, W) if given.
 
     The map depends on the seed and the map's arguments alone: another number of agents gives the same map.
 
@@ -192,7 +192,7 @@ def check_map(height: int, width: int, density: float, border: int = 1) -> None:
 
 
 def style_name(style: Any) -> MapStyle:
-    """The name of a style that is given by name or by its parts.
+    """Return the name of a style that is given by name or by its parts.
 
     Raises:
         ValueError: If it is neither.
@@ -207,7 +207,7 @@ def style_name(style: Any) -> MapStyle:
 
 def _check_parts(parts: Maze | Rooms | Walls | Warehouse) -> None:
     for name, size in asdict(parts).items():
-        if name in ("loops", "straight", "ring"):  # the parts that are no sizes
+        if name in ("loops", "straight", "ring"):  # the parts that are not sizes
             continue
         if not 1 <= arguments.integer(size, f"the {name} of {type(parts).__name__}") <= 9999:
             raise ValueError(f"the {name} of {type(parts).__name__} must lie in 1..9999, got {size}")

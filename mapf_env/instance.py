@@ -19,7 +19,7 @@ Obstacles = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False, slots=True, weakref_slot=True)
 class SharedMap:
-    """What all instances on one map have in common, whose arrays are read-only; made by `SharedMap.of`."""
+    """The read-only arrays that all instances on one map share; made by `SharedMap.of`."""
 
     grid: Obstacles
     """(H, W)"""
@@ -28,7 +28,7 @@ class SharedMap:
 
     @staticmethod
     def of(grid: npt.ArrayLike) -> SharedMap:
-        """Return the shared map with these obstacles, the same object as long as anybody holds it.
+        """Return the shared map with these obstacles, the same object as long as it is referenced.
 
         Raises:
             ValueError: If `grid` is not a map.
@@ -39,7 +39,7 @@ class SharedMap:
 
     @staticmethod
     def known(key: Hashable, make: Callable[[], SharedMap]) -> SharedMap:
-        """Return the map that is known by `key`, a collision-free name of its content; else make it known."""
+        """Return the map stored under `key`, a collision-free name of its content, or store a new one."""
         found = _KNOWN.get(key)
         if found is None:
             _KNOWN[key] = found = make()
@@ -77,7 +77,7 @@ class Instance:
     starts: Cells
     goals: Cells
     shared_map: SharedMap = field(init=False)
-    """The map, with what belongs to it alone."""
+    """The map and the arrays that depend on it alone."""
 
     def __init__(self, grid: npt.ArrayLike | SharedMap, starts: npt.ArrayLike, goals: npt.ArrayLike) -> None:
         shared = grid if isinstance(grid, SharedMap) else SharedMap.of(grid)
@@ -108,7 +108,7 @@ class Instance:
         return len(self.starts)
 
     def at(self, positions: npt.ArrayLike) -> Instance:
-        """The same problem seen from another state: robots stand at `positions` (N, 2), goals are unchanged.
+        """Return the same problem from another state: robots start at `positions` (N, 2), goals are unchanged.
 
         Raises:
             ValueError: If the positions are not distinct free cells from which the goals can be reached.
@@ -138,12 +138,12 @@ class Instance:
 
 
 def as_obstacles(grid: npt.ArrayLike) -> Obstacles:
-    """A contiguous copy of `grid` as (H, W) bool; raises TypeError or ValueError where it is no map."""
+    """Return a contiguous copy of `grid` as (H, W) bool; raises TypeError or ValueError if it is not a map."""
     return as_bool(arguments.shaped(grid, "grid", "(H, W)", " with at least one cell", filled=True), "grid")
 
 
 def as_bool(array: npt.NDArray[Any], name: str) -> Obstacles:
-    """A contiguous copy of maps as bool; raises TypeError or ValueError where cells are neither free nor obstacles."""
+    """Return a contiguous copy of maps as bool; raises TypeError or ValueError if a cell is neither 0 nor 1."""
     if array.dtype != np.bool_:
         if array.dtype.kind not in "iu":
             raise TypeError(f"{name} must be bool (True is an obstacle) or integers 0 and 1, got dtype {array.dtype}")

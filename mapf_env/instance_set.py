@@ -1,4 +1,4 @@
-"""Sets of instances in one file, with a hash of each, so that everybody can tell that they play the same.
+"""Sets of instances in one file, with a hash of each, so that different users can check that they have the same ones.
 
 The file is JSON: `{"format": "mapf-instances", "version": 1, "maps": [...], "instances": [...]}`. A map is a list of
 its rows as text, `.` free and `@` obstacle. An instance is `{"map": index, "starts": [[row, col], ...], "goals": [...],
@@ -25,7 +25,7 @@ _FIELDS = ("map", "starts", "goals", "sha256")
 
 
 def instance_hash(instance: Instance) -> str:
-    """The SHA-256 of an instance, in hexadecimal digits; equal problems have equal hashes on every machine.
+    """Return the SHA-256 of an instance, in hexadecimal digits; equal problems have equal hashes on every machine.
 
     Raises:
         TypeError: If `instance` is not an `Instance`.
@@ -72,7 +72,7 @@ def load_instances(path: PathLike) -> list[Instance]:
 
 
 class InstanceSet:
-    """A file of `save_instances` whose maps and instances are built once they are asked for.
+    """A file of `save_instances` whose maps and instances are built on demand.
 
     Raises:
         ValueError: If it is not a set of instances.
@@ -84,12 +84,12 @@ class InstanceSet:
         try:
             content = json.loads(read_text(path))
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{path} is no set of instances: {error}") from None
+            raise ValueError(f"{path} is not a set of instances: {error}") from None
         if not isinstance(content, dict) or content.get("format") != _FORMAT or content.get("version") != 1:
-            raise ValueError(f'{path} is no set of instances: expected "format": "{_FORMAT}" and "version": 1')
+            raise ValueError(f'{path} is not a set of instances: expected "format": "{_FORMAT}" and "version": 1')
         maps, entries = content.get("maps"), content.get("instances")
         if not isinstance(maps, list) or not isinstance(entries, list):
-            raise ValueError(f'{path} is no set of instances: expected the lists "maps" and "instances"')
+            raise ValueError(f'{path} is not a set of instances: expected the lists "maps" and "instances"')
         self.maps: list[Any] = maps
         self._entries: list[Any] = entries
         self._built: dict[int, SharedMap] = {}
@@ -131,7 +131,7 @@ class InstanceSet:
 
 
 _BEGUN: WeakKeyDictionary[SharedMap, dict[int, Any]] = WeakKeyDictionary()
-"""For each map and number of robots the hash up to the end of the map; that of an instance goes on from there."""
+"""The hash up to the end of the map, by map and number of robots; the hash of an instance continues from there."""
 
 
 def _hash(instance: Instance) -> str:
@@ -148,7 +148,7 @@ def _hash(instance: Instance) -> str:
 
 
 def _text(grid: Obstacles) -> str:
-    """The rows of a map, each with a line feed."""
+    """Return the rows of a map as text, each with a line feed."""
     height, width = grid.shape
     characters = np.full((height, width + 1), ord("\n"), np.uint8)
     characters[:, :width] = np.where(grid, np.uint8(ord("@")), np.uint8(ord(".")))

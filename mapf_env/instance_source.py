@@ -1,4 +1,4 @@
-"""Where the problems of episodes come from: random ones, a set to draw from, or given ones; in arrays."""
+"""Sources of the problems of episodes, as arrays: random ones, draws from a set, or given ones."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class Problems(NamedTuple):
     goals: npt.NDArray[np.int32]
     """(M, N, 2)"""
     team_sizes: npt.NDArray[np.int32]
-    """(M,) how many of the N robots are there."""
+    """(M,) number of robots that are there, of N."""
 
 
 class InstanceSource:
     """The problems of the environments of one configuration.
 
     Args:
-        config: Says how large they are, and what random ones are like.
+        config: The sizes, and the distribution of random problems.
         cases: Instances to draw from, instead of random ones.
-        grid: The map (H, W) of random ones, of the size that the configuration says.
-        fill: Take smaller instances too: the map is filled up with obstacles, and robots are missing.
+        grid: The map (H, W) of random ones, in the size of the configuration.
+        fill: Take smaller instances too: the map is filled up with obstacles, and the missing robots are absent.
 
     Raises:
         ValueError: If there are no cases, one does not fit, or the map has no room for the robots.
@@ -55,7 +55,7 @@ class InstanceSource:
             self.draw(np.zeros(1, np.uint64))  # raises if the map has no room
 
     def draw(self, seeds: npt.NDArray[np.uint64]) -> Problems:
-        """One problem for each seed."""
+        """Return one problem for each seed."""
         if self._cases is None:
             config, count = self._config, len(seeds)
             if self._grid is None:
@@ -69,11 +69,11 @@ class InstanceSource:
         return self.stack([self._cases[i] for i in draws.tolist()], "cases")
 
     def stack(self, instances: Sequence[Instance], name: str) -> Problems:
-        """These instances; messages say `name` of them.
+        """Return these instances as arrays; messages call them `name`.
 
         Raises:
             ValueError: If one does not fit.
-            TypeError: If one is no instance.
+            TypeError: If one is not an `Instance`.
         """
         config, given = self._config, list(arguments.each_of(instances, Instance, name))
         grids = np.ones((len(given), config.height, config.width), np.bool_)

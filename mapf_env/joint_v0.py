@@ -19,7 +19,7 @@ from mapf_env.pixels import RENDER_MODES, RenderMode, Screen
 
 
 class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
-    """All robots decided by one agent: it observes `{"fov": (N, C, F, F), "graph": (N, N)}` and acts by N moves.
+    """One agent decides for all robots: it observes `{"fov": (N, C, F, F), "graph": (N, N)}` and its action is N moves.
 
     With `robot_features` it also observes "scalars" (N, K), with `edge_features` "edge_attr" (N, N, D).
     The reward is the sum of the robots' rewards. Infos carry `action_mask` (N, 5), `replaced` (N,) and `on_goal` (N,),
@@ -87,7 +87,7 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
         return self._seen(step.observation), float(reward), bool(terminated), bool(truncated), infos
 
     def render(self) -> str | npt.NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The current state as `render_mode` has it; None without one and for "human".
+        """Render the current state in `render_mode`; returns None without a mode and for "human".
 
         Raises:
             RuntimeError: Before the first reset.
@@ -111,11 +111,11 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
 
 
 def _of_all(space: spaces.Box, num_agents: int) -> spaces.Box:
-    """The space of what `num_agents` robots observe, each of them in `space`."""
+    """Return the joint observation space of `num_agents` robots, each of which observes `space`."""
     low, high = (np.broadcast_to(bound, (num_agents, *space.shape)) for bound in (space.low, space.high))
     return spaces.Box(low, high, dtype=space.dtype.type)  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def joint_env(**settings: Any) -> JointEnv:
-    """The team as one Gymnasium agent; the settings are those of `JointEnv`."""
+    """Make the team as one Gymnasium agent; the settings are those of `JointEnv`."""
     return JointEnv(**settings)

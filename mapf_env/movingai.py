@@ -1,6 +1,6 @@
 """Maps and scenarios in the MovingAI format (Stern et al. 2019), the benchmark files of the field.
 
-The format counts columns x and rows y; this module turns them into (row, col) at its border.
+The format counts columns x and rows y; this module converts them to (row, col).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _STEPS_PER_BUCKET = 4
 
 
 class _Line(NamedTuple):
-    """A line of a file that is not blank, without blanks at its ends."""
+    """A non-blank line of a file, without blanks at its ends."""
 
     number: int
     text: str
@@ -60,8 +60,8 @@ def load_scen(path: PathLike, num_agents: int | None = None, map_path: PathLike 
     The map is looked for next to the scenario, by the name given there, unless `map_path` says where it is.
 
     Raises:
-        ValueError: If a file is damaged, has fewer entries than agents asked for, or its entries are no valid instance
-            together; the message names the file and the line.
+        ValueError: If a file is damaged, has fewer entries than agents asked for, or its entries are not a valid
+            instance together; the message names the file and the line.
         OSError: If a file cannot be read.
     """
     lines = _lines(read_text(path))
@@ -106,7 +106,7 @@ def save_map(path: PathLike, grid: npt.ArrayLike) -> None:
     """Write the grid (H, W) as a `.map` file, free cells as '.', obstacles as '@'.
 
     Raises:
-        ValueError: If the grid is no map.
+        ValueError: If the grid is not a map.
         TypeError: If the grid has the wrong dtype.
         OSError: If the file cannot be written; an existing one is then unchanged.
     """
@@ -151,7 +151,7 @@ def save_scen(path: PathLike, instance: Instance, map_path: PathLike) -> None:
 
 
 def _shared_map(path: Path) -> SharedMap:
-    """The map of a file; files of equal content have one in common."""
+    """Return the map of a file; files of equal content share one."""
     content = read_bytes(path)
     return SharedMap.known(blake2b(content).digest(), lambda: SharedMap.of(_grid(path, decoded(content))))
 
@@ -194,20 +194,20 @@ def _grid(path: PathLike, text: str) -> Obstacles:
 
 
 def _lines(text: str) -> list[_Line]:
-    """The lines of a text that are not blank, without blanks at their ends."""
+    """Return the non-blank lines of a text, without blanks at their ends."""
     numbered = ((number, line.strip()) for number, line in enumerate(text.split("\n"), start=1))
     return [_Line(number, line) for number, line in numbered if line]
 
 
 def _place(lines: list[_Line], k: int) -> str:
-    """Where the k-th line is, or would be, as an error message names it."""
+    """Return the place of the k-th line, or where it would be, as an error message names it."""
     if k < len(lines):
         return f"line {lines[k].number}"
     return f"line {lines[-1].number + 1 if lines else 1}"
 
 
 def _shown(lines: list[_Line], k: int) -> str:
-    """The k-th line as an error message shows it."""
+    """Return the k-th line as an error message shows it."""
     return repr(lines[k].text[:40]) if k < len(lines) else "the end of the file"
 
 
@@ -267,7 +267,7 @@ def _is_length(text: str) -> bool:
 
 
 def _beside(path: PathLike, entry: _Entry) -> Path:
-    """The map that a scenario names: by its path from there, or, as MovingAI's own tools do, by its last part alone."""
+    """Return the map that a scenario names: by its relative path, or by its file name alone as MovingAI's tools do."""
     map_name = entry.map_name
     parts = PurePosixPath(map_name.replace("\\", "/"))
     folder = Path(path).parent
@@ -275,5 +275,5 @@ def _beside(path: PathLike, entry: _Entry) -> Path:
         if os.path.isfile(candidate):  # False for what can be no file's name too
             return candidate
     raise FileNotFoundError(
-        f"{path}, line {entry.line} names the map {map_name!r}, which is not beside it: put it there or give map_path"
+        f"{path}, line {entry.line} names the map {map_name!r}, which is not next to it: put it there or give map_path"
     )

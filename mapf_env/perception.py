@@ -1,4 +1,4 @@
-"""What robots perceive in given states: teams and maps of any sizes, as one bag."""
+"""Observations of robots in given states: teams and maps of any sizes, as one bag."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Integers = npt.NDArray[np.integer]
 
 
 class Bag(NamedTuple):
-    """What M robots of any number of teams perceive, in the conventions of PyTorch Geometric.
+    """Observations of M robots of any number of teams, in the conventions of PyTorch Geometric.
 
     `perceive` and `BatchedEnv.bag` fill it with NumPy arrays; a network gets the same fields as tensors.
     """
@@ -26,14 +26,14 @@ class Bag(NamedTuple):
     fov: Any
     """(M, C, S, S) fields of view, float32 or uint8."""
     scalars: Any
-    """(M, K) float32, what each robot knows about itself, by `Senses.robot_features`."""
+    """(M, K) float32, features of each robot, as `Senses.robot_features` names them."""
     edge_index: Any
     """(2, E) int64, the sender and the receiver of each edge, as numbers of robots of the bag; by receiver, then
     sender."""
     edge_weight: Any
     """(E,) float32, weights of the communication graph."""
     edge_attr: Any
-    """(E, D) float32, what the receiver knows about the sender, by `Senses.edge_features`."""
+    """(E, D) float32, features of the sender as the receiver knows them, as `Senses.edge_features` names them."""
     team: Any
     """(M,) int64, the team of each robot, ascending."""
 
@@ -45,7 +45,7 @@ class States:
     maps: npt.NDArray[np.int32]
     """(T,) the map of each team, an index into a `MapSet`."""
     offsets: npt.NDArray[np.int64]
-    """(T + 1,) where the robots of each team begin; the last entry is R."""
+    """(T + 1,) the first row of each team; the last entry is R."""
     positions: Integers
     """(R, 2) row and column of each robot."""
     goals: Integers
@@ -84,7 +84,7 @@ class States:
         return np.arange(ends[-1] if len(ends) else 0) + np.repeat(self.offsets[teams] - ends + sizes, sizes)
 
     def take(self, chosen: npt.ArrayLike) -> States:
-        """The chosen teams (B,), by their numbers or as a mask (T,), in the order given."""
+        """Return the chosen teams (B,), by their numbers or as a mask (T,), in the order given."""
         teams = _numbers(chosen)
         sizes, robots = np.diff(self.offsets)[teams], self.rows(teams)
         offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes, dtype=np.int64)])
@@ -97,7 +97,7 @@ class States:
 
     @staticmethod
     def concatenate(parts: Sequence[States]) -> States:
-        """All teams of `parts`, in order; they index the same maps."""
+        """Return all teams of `parts`, in order; they index the same maps."""
         if not parts:
             raise ValueError("there are no states to concatenate: give at least one part")
         ends = np.cumsum([0, *(part.num_robots for part in parts[:-1])])
@@ -118,7 +118,7 @@ class States:
         seeds: npt.ArrayLike | None = None,
         limits: npt.ArrayLike = 128,
     ) -> States:
-        """The first states of instances.
+        """Return the start states of instances.
 
         Args:
             instances: The T instances.
@@ -171,10 +171,10 @@ _SHIFTS = np.array([-64, -1, 64, 1, 0, 0], np.int16)
 
 
 def is_stuck(positions: Integers, goals: Integers, moves: npt.NDArray[np.int8]) -> npt.NDArray[np.bool_]:
-    """(...) the robots that are off their goal, on a cell where they stood at one of their last steps.
+    """Return the robots (...) that are off their goal and on a cell where they stood in one of their last steps.
 
-    A robot that was stopped is stuck in the next step, and one that goes to and fro or in a circle as soon as it comes
-    back; one on its way never is. A robot knows this by itself: it takes no map and no messages.
+    A robot that was stopped is stuck in the next step; one that moves back and forth or in a circle is stuck as soon as
+    it comes back; one on its way never is. A robot finds this out by itself, without map or messages.
 
     Args:
         positions: (..., 2)
@@ -186,7 +186,7 @@ def is_stuck(positions: Integers, goals: Integers, moves: npt.NDArray[np.int8]) 
 
 
 class MapSet:
-    """Maps of any sizes, each of them once, inside borders of obstacles; what `perceive` reads.
+    """Maps of any sizes inside borders of obstacles, each stored once, as `perceive` reads them.
 
     Args:
         grids: (H, W) maps, True is an obstacle; equal ones share their memory.
@@ -227,7 +227,7 @@ class MapSet:
         return len(self._sizes)
 
     def grid(self, number: int) -> npt.NDArray[np.bool_]:
-        """(H, W) the map of that number; a copy."""
+        """Return a copy of the map (H, W) of that number."""
         height, width = self._sizes[number].tolist()
         sides, first, border = (height + 2 * self.border, width + 2 * self.border), self._offsets[number], self.border
         bordered = self._cells[first : first + sides[0] * sides[1]].reshape(sides)
@@ -235,7 +235,7 @@ class MapSet:
 
 
 def perceive(states: States, maps: MapSet, senses: Senses, *, message_loss: float = 0.0, threads: int = 1) -> Bag:
-    """What the robots of teams in given states perceive.
+    """Return the observations of the robots of teams in given states.
 
     The communication radius of each team is that of its state; `senses` gives everything else. Messages are lost by the
     seed and the time of the state, exactly as in the environments.
@@ -243,9 +243,9 @@ def perceive(states: States, maps: MapSet, senses: Senses, *, message_loss: floa
     Args:
         states: The joint states.
         maps: The maps that they index, inside borders of at least `senses.fov_radius`; the views have their dtype.
-        senses: What robots see, know and hear.
+        senses: The settings of perception.
         message_loss: Probability that an edge fails.
-        threads: Over how many threads the teams are spread; it changes no result.
+        threads: Threads that share the teams; results do not depend on it.
 
     Raises:
         ValueError: If an index, shape or cell does not fit; the message names the team and the robot.
@@ -274,11 +274,11 @@ _ARRAYS = {
     "limits": (np.dtype(np.int32), "iu", 1),
     "comm_radius": (np.dtype(np.float64), "iuf", 1),
 }
-"""The arrays of states as the native core reads them, in its order: dtype, kinds that are taken for it, axes."""
+"""The arrays of states in the order of the native core: dtype, accepted kinds, axes."""
 
 
 def _array(given: Any, name: str) -> npt.NDArray[Any]:
-    """An array of states as the native core reads it."""
+    """Return an array of states as the native core reads it."""
     dtype, kinds, axes = _ARRAYS[name]
     if type(given) is np.ndarray and given.dtype == dtype and given.ndim == axes and given.flags.c_contiguous:
         return given
@@ -296,6 +296,6 @@ def _array(given: Any, name: str) -> npt.NDArray[Any]:
 
 @lru_cache(maxsize=64)
 def _require_dtype(senses: Senses, dtype: str) -> None:
-    """Raise ValueError if views of that dtype cannot hold what is sensed; the answer is remembered between calls."""
+    """Raise ValueError if views of that dtype cannot hold the values of a channel; the answer is cached."""
     if dtype == "uint8":
         require_bytes(senses)

@@ -20,7 +20,7 @@ _WALL, _FLOOR, _LINE = np.array([(59, 66, 82), (255, 255, 255), (232, 235, 239)]
 
 
 class Screen:
-    """Shows the first team of a batch in a render mode; without one nothing.
+    """Shows the first team of a batch in a render mode; without a mode it shows nothing.
 
     Args:
         mode: "ansi" returns text, "rgb_array" a picture (H', W', 3), "human" prints the text. In a terminal each state
@@ -28,7 +28,7 @@ class Screen:
         fps: States that a terminal shows in a second.
 
     Raises:
-        ValueError: If there is no such mode.
+        ValueError: If the mode is unknown.
     """
 
     def __init__(self, mode: RenderMode | None, fps: float) -> None:
@@ -61,9 +61,10 @@ class Screen:
 
 
 def text(grid: Obstacles, positions: npt.NDArray[np.integer], goals: npt.NDArray[np.integer]) -> str:
-    """The map in lines: # obstacle, . free, a letter for each robot, in lower case for its goal, * a robot on its goal.
+    """Return the map as lines of text.
 
-    The letters begin anew after the 26th robot.
+    # is an obstacle, . free, a letter a robot, in lower case its goal, and * a robot on its goal.
+    The letters repeat after the 26th robot.
     """
     cells = np.where(grid, "#", ".")
     letters = np.array([chr(ord("A") + i % 26) for i in range(len(positions))])
@@ -76,7 +77,7 @@ def text(grid: Obstacles, positions: npt.NDArray[np.integer], goals: npt.NDArray
 def picture(
     grid: Obstacles, positions: npt.NDArray[np.integer], goals: npt.NDArray[np.integer]
 ) -> npt.NDArray[np.uint8]:
-    """The map as an RGB picture (16 H, 16 W, 3): obstacles dark, robots discs, goals frames in their robot's colour."""
+    """Return the map as an RGB picture (16 H, 16 W, 3): robots are discs, goals frames in their robot's colour."""
     height, width = grid.shape
     pixels = np.empty((height, _CELL, width, _CELL, 3), np.uint8)
     pixels[:] = np.where(grid[:, None, :, None, None], _WALL, _FLOOR)

@@ -40,7 +40,7 @@ def animate(
     pause_steps: int = 3,
     goals: npt.ArrayLike | None = None,
 ) -> str:
-    """The robots driving along their paths, as an SVG that plays in a loop.
+    """Return the robots driving along their paths, as an SVG that plays in a loop.
 
     Goals are hollow squares in their robot's colour, filled while the robot rests there; robots that are not on their
     goals at the end get a red ring. The paths need not solve the instance, so a failed rollout can be watched too.
@@ -48,10 +48,10 @@ def animate(
     Args:
         instance: The map and the goals.
         solution: The paths (T + 1, N, 2).
-        path: Where to write the SVG too, if anywhere.
+        path: A file to write the SVG to, if given.
         title: A line above the map.
-        step_seconds: How long a step lasts.
-        pause_steps: For how many steps' time the loop rests on the first and on the last state.
+        step_seconds: Duration of a step.
+        pause_steps: Pause on the first and on the last state, in steps.
         goals: The goals (T + 1, N, 2) at each time, `env.goals` after the reset and each step of a lifelong task; those
             of the instance at all times if not given.
 
@@ -74,7 +74,7 @@ def animate(
 
 
 def draw(instance: Instance, solution: Solution | None = None) -> str:
-    """The robots on their starts and their goals as a still SVG, with the paths where a solution is given.
+    """Return the robots on their starts and their goals as a still SVG, with the paths if a solution is given.
 
     A path that does not end on the robot's goal gets a red ring at its end.
 
@@ -280,7 +280,7 @@ def _caption_line(instance: Instance) -> int:
 
 
 def require_title(title: str | None) -> None:
-    """Raise TypeError if the title is no text."""
+    """Raise TypeError if the title is not text."""
     if title is not None:
         arguments.instance_of(title, str, "title")
 

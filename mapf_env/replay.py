@@ -20,10 +20,10 @@ from mapf_env.solution import Solution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What a page of replays shows at a time: one instance, and solutions of it side by side on one clock."""
+    """One scene of a replay page: an instance, and solutions of it that play at the same time."""
 
     title: str
-    """Its line in the choice of scenes."""
+    """Its entry in the list of scenes."""
     instance: Instance
     """The map and the goals."""
     solutions: Mapping[str, Solution]
@@ -41,12 +41,12 @@ def replay(
     config: EnvConfig | None = None,
     goals: npt.ArrayLike | None = None,
 ) -> str:
-    """The page; it needs no network. A click on a robot shows its field of view, its neighbours and its goal.
+    """Return a page that works offline; a click on a robot shows its field of view, neighbours and goal.
 
     Args:
         instance: The map and the goals.
         solution: The paths (T + 1, N, 2), which need not solve the instance.
-        path: Where to write the page too, if anywhere.
+        path: A file to write the page to, if given.
         title: A line above the map.
         config: The settings whose fov_radius, comm_radius and comm_range are shown; the paper's if not given.
         goals: The goals (T + 1, N, 2) at each time, `env.goals` after the reset and each step of a lifelong task; those
@@ -67,16 +67,16 @@ def replay(
 def replay_scenes(
     scenes: Sequence[Scene], path: PathLike | None = None, *, title: str, config: EnvConfig | None = None
 ) -> str:
-    """The page of `replay` for several scenes to choose from, each with its solutions side by side.
+    """Return the page of `replay` for several scenes to choose from, each with its solutions next to each other.
 
     Args:
         scenes: At least one.
-        path: Where to write the page too, if anywhere.
+        path: A file to write the page to, if given.
         title: A line above all of them.
         config: The settings whose fov_radius, comm_radius and comm_range are shown; the paper's if not given.
 
     Raises:
-        ValueError: If there is no scene, one has no solution, its paths are of another number of agents or leave the
+        ValueError: If there are no scenes, one has no solution, its paths are of another number of agents or leave the
             map, or goals do not belong to a solution.
         TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written.
@@ -133,7 +133,7 @@ def _plain(scene: Scene, config: EnvConfig) -> dict[str, object]:
 
 
 def _changes(goals: Cells) -> list[list[list[int]]]:
-    """For each robot its first goal and all later ones, each with its time: [time, row, column]."""
+    """Return the goals of each robot, each with the time from which it holds: [time, row, column]."""
     changed = np.ones(goals.shape[:2], np.bool_)
     changed[1:] = np.any(goals[1:] != goals[:-1], axis=2)
     return [

@@ -1,4 +1,4 @@
-"""What robots earn: a sum of parts, and named schemes."""
+"""Rewards: a sum of parts, and named schemes."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from mapf_env import arguments
 
 @dataclass(frozen=True, slots=True)
 class Rewards:
-    """What a robot gets in a step; all parts that apply add up.
+    """The reward of a robot in a step, as the sum of the parts that apply.
 
     Raises:
         ValueError: If a part is infinite or not a number.
-        TypeError: If a part is none at all.
+        TypeError: If a part is not a number.
     """
 
     on_goal: float = 0.0
-    """It is on its goal after the step."""
+    """The robot is on its goal after the step."""
     off_goal: float = 0.0
-    """It is not."""
+    """The robot is off its goal after the step."""
     arrival: float = 0.0
-    """It has moved onto its goal in this step."""
+    """The robot has moved onto its goal in this step."""
     replaced: float = 0.0
-    """The shield replaced its action."""
+    """The shield replaced the robot's action."""
     solved: float = 0.0
     """All robots of the team are on their goals at once: the episode terminates."""
     closer: float = 0.0
-    """For each step by which the shortest way to its goal has become shorter (negative if longer)."""
+    """For each step by which the shortest path to the goal has become shorter (negative if longer)."""
 
     def __post_init__(self) -> None:
         for name, part in asdict(self).items():
@@ -42,9 +42,9 @@ SCHEMES: dict[str, Rewards] = {
 }
 """Schemes by name.
 
-- flowtime: -1 for each step off the goal; the return is the negated flowtime but for a constant.
-- shaped: the same plus what the robot came closer, the change of a potential (Ng, Harada and Russell 1999). It changes
-  no optimal policy without discounting, in one-shot tasks that end before max_cycles.
+- flowtime: -1 for each step off the goal; the return is a constant minus the flowtime.
+- shaped: the same plus the change of the distance, a potential (Ng, Harada and Russell 1999). It does not change the
+  optimal policy without discounting, in one-shot tasks that end before max_cycles.
 - arrival: 1 for each arrival; in lifelong tasks the return is the throughput.
 - solved: 1 for every robot when the whole team is on its goals, and nothing else.
 """

@@ -1,4 +1,4 @@
-"""What a robot sees, knows and hears: settings that environments and policies share."""
+"""Settings of perception that environments and policies share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CommRange = Literal["fixed", "connected"]
 CommWeights = Literal["binary", "distance"]
 
 HISTORY: int = _native.HISTORY
-"""How many of its last moves every robot remembers."""
+"""Number of last moves that every robot remembers."""
 
 _PAPER = 3
 
@@ -63,7 +63,7 @@ def edge_features(memory: int = 4) -> dict[str, Feature]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Senses:
-    """What a robot sees, knows and hears; the defaults are the paper's.
+    """The settings of a robot's perception: views, features and communication; the defaults are the paper's.
 
     Raises:
         ValueError: If a setting is out of its range, or a name is unknown or given twice.
@@ -71,19 +71,19 @@ class Senses:
     """
 
     fov_radius: int = 4
-    """How many cells a robot sees in each direction (the paper's r_FOV)."""
+    """Cells that a robot sees in each direction (the paper's r_FOV)."""
     extra_channels: tuple[str, ...] = ()
     """Channels of the views after the paper's three, by name; `docs/environment.md` lists them."""
     robot_features: tuple[str, ...] = ()
-    """Facts that a robot knows about itself, by name, as columns of `scalars`."""
+    """Features of the robot itself, by name, as columns of `scalars`."""
     edge_features: tuple[str, ...] = ()
-    """Facts that a robot knows about each robot it hears, by name, as columns of `edge_attr`."""
+    """Features of each robot that it hears, by name, as columns of `edge_attr`."""
     memory: int = 4
-    """How many of the last moves the features "last_moves" show, 1..16."""
+    """Number of last moves that the features "last_moves" show, 1..16."""
     comm_radius: float = 5.0
     """Robots closer than this hear each other, in cells (the paper's r_COMM)."""
     comm_range: CommRange = "fixed"
-    """"connected": at reset comm_radius grows by 10 % until the team is connected, as in the paper's released code."""
+    """"connected": at reset comm_radius grows by 10 % until the team is connected, as in the authors' code."""
     comm_weights: CommWeights = "binary"
     """Weights of the communication graph: 1, or with "distance" 1 / distance."""
 
@@ -106,7 +106,7 @@ class Senses:
             raise ValueError('comm_radius must be positive to grow, got 0.0 with comm_range="connected"')
 
     def senses(self) -> dict[str, Any]:
-        """Exactly the fields of `Senses`, for passing them on as settings of an environment."""
+        """Return exactly the fields of `Senses`, to pass them on as settings of an environment."""
         return {each.name: getattr(self, each.name) for each in fields(Senses)}
 
     @property
@@ -131,7 +131,7 @@ class Senses:
 
     @property
     def needs_map(self) -> bool:
-        """True if a channel or feature shows what only the whole map tells."""
+        """True if a channel or feature needs the whole map."""
         chosen = (*self._channels(), *self._robot_features(), *self._edge_features())
         return any(each.needs_map for each in chosen)
 
@@ -189,7 +189,7 @@ def _bounds(chosen: list[Feature]) -> tuple[npt.NDArray[np.float32], npt.NDArray
 
 
 def _names(given: Iterable[str], name: str, known: Iterable[str]) -> tuple[str, ...]:
-    """The given names as a tuple, each of them known and different from the others."""
+    """Return the given names as a tuple; each must be known and occur once."""
     if isinstance(given, str):
         raise TypeError(f'{name} must be a sequence of names such as ("{given}",), got {given!r}')
     names = tuple(arguments.each_of(given, str, name))

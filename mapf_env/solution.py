@@ -1,4 +1,4 @@
-"""The answer: a path for each robot, its cost, and an audit of what is wrong with it."""
+"""Solutions: a path for each robot, their cost, and an audit that finds what is wrong with them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mapf_env.instance import Cells, Instance
 T = TypeVar("T")
 
 _CELLS_AT_ONCE = 1 << 20
-"""Cells of paths that an audit looks at in one go, which bounds its memory."""
+"""Number of cells that an audit processes at a time, which bounds its memory."""
 
 
 class Action(IntEnum):
@@ -75,7 +75,7 @@ class Solution:
 
     @property
     def arrivals(self) -> npt.NDArray[np.int64]:
-        """(N,) the time from which each robot stays where it ends; a goal that is left again does not count."""
+        """(N,) the time from which each robot stays on its last cell; a goal that is left again does not count."""
         elsewhere = (self.paths != self.paths[-1]).any(axis=2)
         steps = np.arange(1, len(self.paths) + 1)[:, None]
         return np.where(elsewhere, steps, 0).max(axis=0)
@@ -109,7 +109,7 @@ class Solution:
         return is_action.argmax(axis=2).astype(np.int8)
 
     def conflicts(self, most: int | None = None) -> list[Conflict]:
-        """Vertex and swap conflicts in the order of time: all of them, or the first `most`.
+        """Return vertex and swap conflicts in the order of time: all of them, or the first `most`.
 
         Time and memory grow with T N log(T N) and the number of conflicts returned, not with the square of N.
         """
@@ -117,7 +117,7 @@ class Solution:
         return list(islice(chain.from_iterable(each.listed() for each in self._clashes()), limit))
 
     def violations(self, instance: Instance, most: int | None = 20) -> list[str]:
-        """What keeps these paths from solving `instance`, in words; empty if they solve it.
+        """Return the reasons, in words, why these paths do not solve `instance`; empty if they solve it.
 
         If there are more than `most` violations, the list holds the first ones and ends with a line that counts the
         rest. None lists all of them.
@@ -134,7 +134,7 @@ class Solution:
         return first if len(first) == count else [*first, f"and {count - len(first)} more"]
 
     def count_violations(self, instance: Instance) -> int:
-        """Count what keeps these paths from solving `instance`; 0 if they solve it.
+        """Count the violations that keep these paths from solving `instance`; 0 if they solve it.
 
         Raises:
             TypeError: If `instance` is not an `Instance`.
@@ -162,7 +162,7 @@ class Solution:
             yield _Found(clash.number, partial(map, str, clash.listed()))
 
     def _clashes(self) -> Iterator[_Found[Conflict]]:
-        """The conflicts of each time, those of vertices first."""
+        """Return the conflicts of each time, vertex conflicts first."""
         for first, part in self._parts(overlap=1):
             cells = part.astype(np.int64)
             cells = cells[..., 0] << 32 | cells[..., 1] & 0xFFFFFFFF
@@ -175,7 +175,7 @@ class Solution:
                     yield _clash("swap", first + k, _in_exchange(cells[k - 1], cells[k]), part[k])
 
     def _parts(self, overlap: int) -> Iterator[tuple[int, Cells]]:
-        """The paths in parts of bounded memory, each with its first time; `overlap` times belong to two parts."""
+        """Yield the paths in parts of bounded memory, each with its first time; `overlap` times belong to two parts."""
         steps = max(1, _CELLS_AT_ONCE // self.paths.shape[1])
         for first in range(0, max(1, len(self.paths) - overlap), steps):
             yield first, self.paths[first : first + steps + overlap]
@@ -186,7 +186,7 @@ class Solution:
 
 
 class _Found(NamedTuple, Generic[T]):
-    """A number of things, and a call that lists them one by one."""
+    """A number of violations, and a call that lists them one by one."""
 
     number: int
     listed: Callable[[], Iterable[T]]
@@ -199,7 +199,7 @@ def _misplaced(robots: npt.NDArray[np.intp], cells: Cells, expected: Cells, verb
 
 def _off_the_floor(wrong: npt.NDArray[np.intp], part: Cells, first: int) -> Iterator[str]:
     for time, robot in wrong:
-        yield f"agent {robot} is at {_cell(part[time, robot])} at time {first + time}, which is no free cell"
+        yield f"agent {robot} is at {_cell(part[time, robot])} at time {first + time}, which is not a free cell"
 
 
 def _jumps(wrong: npt.NDArray[np.intp], first: int) -> Iterator[str]:
@@ -253,7 +253,7 @@ def _groups_of_equals(values: npt.NDArray[np.integer]) -> list[npt.NDArray[np.in
 def _clash(
     kind: Literal["vertex", "swap"], time: int, partners: dict[int, list[int]], cells: Cells
 ) -> _Found[Conflict]:
-    """The conflicts of each robot with its partners, each pair once."""
+    """Return the conflicts of each robot with its partners, each pair once."""
 
     def listed() -> Iterator[Conflict]:
         for robot in sorted(partners):

@@ -1,4 +1,4 @@
-"""The means of SVG: elements that change with time, outlines of obstacles, colours and clean text."""
+"""Parts of SVG documents: elements that change with time, outlines of obstacles, colours and clean text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mapf_env.instance import Obstacles
 
 
 class Clock:
-    """Turns what happens at the times 0..`last` of a loop into SVG animation elements."""
+    """Converts values at the times 0..`last` of a loop to SVG animation elements."""
 
     def __init__(self, last: int, step_seconds: float) -> None:
         self.last = last

@@ -1,4 +1,4 @@
-"""All that B teams carry from step to step, in arrays that the native core changes in place."""
+"""The state of B teams, in arrays that the native core changes in place."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TeamState:
     streams: npt.NDArray[np.uint64]
     """(B,) the seed of each environment's stream of episodes."""
     episodes: npt.NDArray[np.uint64]
-    """(B,) how many episodes of its stream have begun."""
+    """(B,) number of episodes of its stream that have begun."""
     seeds: npt.NDArray[np.uint64]
     """(B,) the seed of the episode."""
     grids: npt.NDArray[np.bool_]
@@ -27,7 +27,7 @@ class TeamState:
     obstacles: npt.NDArray[Any]
     """(B, H + 2 r, W + 2 r) the maps inside their borders, in the views' dtype."""
     team_sizes: npt.NDArray[np.int32]
-    """(B,) how many robots are there."""
+    """(B,) number of robots that are there."""
     positions: npt.NDArray[np.int32]
     """(B, N, 2)"""
     goals: npt.NDArray[np.int32]
@@ -37,7 +37,7 @@ class TeamState:
     under_way: npt.NDArray[np.int32]
     """(B, N) steps since the robot was on its goal, or since reset."""
     arrivals: npt.NDArray[np.int32]
-    """(B, N) how often the robot has arrived."""
+    """(B, N) number of arrivals of the robot."""
     comm_radius: npt.NDArray[np.float64]
     """(B,)"""
     regions: npt.NDArray[np.int32]
@@ -65,11 +65,11 @@ class TeamState:
     on_goal: npt.NDArray[np.bool_]
     """(B, N)"""
     action_mask: npt.NDArray[np.int8]
-    """(B, N, 5) as of the last time it was asked for."""
+    """(B, N, 5) as it was last computed."""
 
     @staticmethod
     def empty(num_envs: int, config: EnvConfig) -> TeamState:
-        """Before the first reset."""
+        """Return the state before the first reset."""
         B, N, border = num_envs, config.num_agents, 2 * config.fov_radius
         padded = config.height + border, config.width + border
         size = padded[0] * padded[1]
@@ -102,6 +102,6 @@ class TeamState:
         )
 
     def writeable(self) -> TeamState:
-        """The same, with copies of the arrays that cannot be written, as those are that were unpickled out of band."""
+        """Return the same state with writable copies of read-only arrays, such as those unpickled out of band."""
         arrays = (getattr(self, each.name) for each in fields(self))
         return TeamState(*(array if array.flags.writeable else array.copy() for array in arrays))

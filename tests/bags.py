@@ -87,7 +87,7 @@ def permuted(bag: Bag, order: npt.NDArray[np.integer], generator: np.random.Gene
 
 
 def at_start(instances: Sequence[Instance], senses: Senses) -> Bag:
-    """What the robots of all instances perceive at the start, as tensors."""
+    """Return the observations of all instances at the start, as tensors."""
     maps = MapSet([each.grid for each in instances], senses.fov_radius, "uint8")
     bag = perceive(States.start_of(instances, senses, maps.index), maps, senses)
     return Bag(*(torch.from_numpy(each) for each in bag))  # pyright: ignore[reportArgumentType]

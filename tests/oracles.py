@@ -1,4 +1,4 @@
-"""Slow judges in plain Python, written from the definitions; they share no code with what they judge.
+"""Slow oracles in plain Python, written from the definitions; they share no code with the code under test.
 
 A cell is a tuple (row, col), a map a set of free cells or an (H, W) bool array, a team a list of cells.
 """
@@ -26,12 +26,12 @@ def cells(array: Iterable[Iterable[int]]) -> list[Cell]:
 
 
 def moved(cell: Cell, action: int) -> Cell:
-    """Where `action` leads from `cell`."""
+    """Return the cell to which `action` leads from `cell`."""
     return cell[0] + STEP[action][0], cell[1] + STEP[action][1]
 
 
 def free_cells(grid: Grid) -> set[Cell]:
-    """The cells of the map that are no obstacle."""
+    """Return the free cells of the map."""
     height, width = grid.shape
     return {(row, col) for row in range(height) for col in range(width) if not grid[row, col]}
 
@@ -173,7 +173,7 @@ def swap_partner(
         return to_goal[who].get(cell, float("inf"))
 
     def onward(back: Cell, front: Cell) -> list[Cell]:
-        """Where a robot that came to `front` from `back` can go on to."""
+        """Return the cells to which a robot that came to `front` from `back` can continue."""
         blocked = {cell for cell in around(front) if len(around(cell)) == 1 and cell in team}
         blocked = {cell for cell in blocked if goals[team.index(cell)] == cell}
         return [cell for cell in around(front) if cell != back and cell not in blocked]
@@ -211,7 +211,7 @@ def swap_partner(
 
 
 def field_of_view(grid: Grid, positions: Sequence[Cell], goals: Sequence[Cell], robot: int, radius: int) -> Grid:
-    """What `robot` sees, (3, 2 * radius + 3, 2 * radius + 3): obstacles, own goal, robots.
+    """Return the view of `robot`, (3, 2 * radius + 3, 2 * radius + 3): obstacles, own goal, robots.
 
     The window of 2 * radius + 1 cells a side lies inside a ring of one cell. Outside the map is obstacle. A goal in
     the window stands at its place; any other is projected on the ring along the line to it, half rounded to even.

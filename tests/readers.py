@@ -1,4 +1,4 @@
-"""What every reader of files promises, whatever the bytes: an instance, map or paths, or an error that says where.
+"""The contract of all readers of files: any bytes give an instance, map or paths, or an error that says where.
 
 Run as a script this is a target for coverage-guided fuzzing, which needs `pip install atheris`:
     python tests/readers.py -max_total_time=300
@@ -47,7 +47,7 @@ WHERE = {
     "log": r"line \d+|holds no paths|table of",
     "json": r"line \d+ column \d+|(map|instance) \d+|expected|position \d+|recursion|digits",
 }
-"""How the message of an error names the place, for each kind of file."""
+"""The place that an error message names, for each kind of file."""
 
 
 def samples(folder: Path) -> dict[str, bytes]:
@@ -65,7 +65,7 @@ def samples(folder: Path) -> dict[str, bytes]:
 
 
 def faults(kind: str, content: bytes, folder: Path) -> list[str]:
-    """What the reader of that kind does with the content that it should not do; `folder` is for the file."""
+    """Return the violations of the contract by the reader of that kind; `folder` is for the file."""
     (folder / "a.map").write_bytes(MAP)
     path = folder / f"read.{kind}"
     path.write_bytes(content)
@@ -81,13 +81,13 @@ def faults(kind: str, content: bytes, folder: Path) -> list[str]:
 
 
 def unsound(found: Any) -> list[str]:
-    """What is wrong with a map, an instance or paths that a reader has accepted."""
+    """Return the faults of a map, an instance or paths that a reader has accepted."""
     if isinstance(found, mapf_env.Solution):
-        return [] if (found.paths >= 0).all() and found.paths.ndim == 3 else ["these are no paths"]
+        return [] if (found.paths >= 0).all() and found.paths.ndim == 3 else ["these are not paths"]
     if isinstance(found, np.ndarray):
-        return [] if found.dtype == np.bool_ and found.ndim == 2 and found.size else ["this is no map"]
+        return [] if found.dtype == np.bool_ and found.ndim == 2 and found.size else ["this is not a map"]
     if not isinstance(found, mapf_env.Instance):
-        return ["this is no instance"]
+        return ["this is not an instance"]
     wrong = unsound(found.grid)
     for name, cells in (("start", found.starts), ("goal", found.goals)):
         places = {tuple(cell) for cell in cells.tolist()}
@@ -95,7 +95,7 @@ def unsound(found: Any) -> list[str]:
         if len(places) < len(cells) or not all(
             0 <= row < height and 0 <= col < width and not found.grid[row, col] for row, col in places
         ):
-            wrong.append(f"a {name} is no cell of its own")
+            wrong.append(f"a {name} is not a cell of its own")
     return wrong
 
 

@@ -53,7 +53,7 @@ CROWDS = replace(
     clip_norm=1.0,
     averaging=0.9,
 )
-"""What the recipe for crowds adds."""
+"""The settings that the recipe for crowds adds."""
 
 
 def arguments_for(config, folder):

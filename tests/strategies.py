@@ -1,4 +1,4 @@
-"""Hypothesis strategies for the world: small maps, problems, teams and joint actions."""
+"""Hypothesis strategies: small maps, problems, teams and joint actions."""
 
 from __future__ import annotations
 

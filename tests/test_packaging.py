@@ -1,4 +1,4 @@
-"""What a user may rely on once the package is installed."""
+"""The promises of an installed package."""
 
 import ast
 import importlib.metadata
@@ -36,7 +36,7 @@ def test_no_package_reaches_into_the_native_core_of_another() -> None:
 
 
 @pytest.mark.parametrize("package", ["mapf_env", "experts"])
-def test_world_and_teachers_import_no_learning_library(package: str) -> None:
+def test_mapf_env_and_experts_import_no_learning_library(package: str) -> None:
     loaded = run_python(f"import sys, {package}; print(*{{name.split('.')[0] for name in sys.modules}})").split()
     assert package in loaded
     assert not set(LEARNING_LIBRARIES) & set(loaded)

@@ -3,7 +3,7 @@
 Long commands are parsed but not carried out, and commands of installation are looked up. A block that begins with the
 name of a file, as `# my_layers.py`, is also saved as that.
 
-The pages of docs/frameworks need packages that can't stand beside each other. Each runs in an interpreter of its own
+The pages of docs/frameworks need packages that can't be installed together. Each runs in an interpreter of its own
 where its packages are, and is skipped elsewhere; `pytest tests/test_pages.py -k PAGE -s` shows what it measures.
 """
 
@@ -79,7 +79,7 @@ def carry_out(line: str) -> None:
         case ["bash", script]:
             assert (ROOT / script).is_file()
         case [tool, *_]:
-            assert shutil.which(tool), f"{tool} of {line!r} is no command that this project brings"
+            assert shutil.which(tool), f"{tool} of {line!r} is not a command of this project"
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What callers give by mistake, by what is expected, and the law that they are told so."""
+"""Wrong arguments by the expected kind, and the check that the error names them."""
 
 from __future__ import annotations
 

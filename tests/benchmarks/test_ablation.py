@@ -87,7 +87,7 @@ def test_every_variant_is_a_setting_of_its_own(ablation: ModuleType, ablation_na
     assert configs[0] == ablation.BASE
 
 
-def test_all_teachers_are_judged_by_the_same_cases(ablation: ModuleType, tmp_path: Path) -> None:
+def test_all_experts_are_evaluated_on_the_same_cases(ablation: ModuleType, tmp_path: Path) -> None:
     ablation.main(ablation.Options("labels", tmp_path, only=("PIBT", "w = 1.5"), updates=1))
     headings, _, *found = rows((tmp_path / "labels.md").read_text())
     assert [row[0] for row in found] == ["w = 1.5", "PIBT"]

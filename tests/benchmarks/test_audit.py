@@ -1,19 +1,19 @@
-"""The judge of the audit finds what is wrong, and the audit passes on what is right."""
+"""The audit finds wrong steps and passes right ones."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 
-from audit import Options, judge, main
+from audit import Options, audit_step, main
 
 UP, LEFT, DOWN, RIGHT, IDLE = range(5)
 RING = [(0, 0), (0, 1), (1, 1), (1, 0)]
 
 
-def judged(before: Any, wanted: Any, after: Any, replaced: Any, grid: Any = ((0, 0, 0), (0, 0, 1))) -> tuple[int, int]:
+def audited(before: Any, wanted: Any, after: Any, replaced: Any, grid: Any = ((0, 0, 0), (0, 0, 1))) -> tuple[int, int]:
     """Collisions and other faults of one step of one team."""
-    tally = judge(
+    tally = audit_step(
         np.array([grid], bool), np.array([before]), np.array([wanted]), np.array([after]), np.array([replaced])
     )
     return tally.collisions, tally.other_faults
@@ -39,8 +39,10 @@ def judged(before: Any, wanted: Any, after: Any, replaced: Any, grid: Any = ((0,
         ([(0, 0)], [RIGHT], [(0, 1)], [True], (0, 1)),
     ],
 )
-def test_the_judge_counts(before: Any, wanted: Any, after: Any, replaced: Any, expected: tuple[int, int]) -> None:
-    assert judged(before, wanted, after, replaced) == expected
+def test_the_audit_counts_faults(
+    before: Any, wanted: Any, after: Any, replaced: Any, expected: tuple[int, int]
+) -> None:
+    assert audited(before, wanted, after, replaced) == expected
 
 
 def test_the_audit_passes(capsys: pytest.CaptureFixture[str]) -> None:

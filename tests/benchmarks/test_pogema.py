@@ -262,23 +262,23 @@ def test_pibt_solves_what_it_solves_as_a_planner_and_counts_who_is_home_where_it
     assert played.flowtime[1] >= 60
 
 
-def test_plans_are_judged_as_rollouts_are() -> None:
-    """Two code paths, one rule: the judge of plans gives what `rollout` counts for the same paths."""
+def test_plans_are_scored_like_rollouts() -> None:
+    """Plans and rollouts with the same paths have the same outcomes."""
     grid = parse_map("....\n....")
     instances = [Instance(grid, [(0, 0), (1, 3)], [(0, 3), (1, 0)]), Instance(grid, [(0, 0), (0, 1)], [(0, 1), (0, 0)])]
     for max_steps in (1, 2, 3, 30):
         played: Rollouts = rollout(
             load("n4"), instances, execution=Execution(actions="sampled"), seed=5, max_steps=max_steps
         )
-        judged = pogema_methods.judge(instances, [each.paths for each in played.solutions], max_steps)
-        assert judged.success.tolist() == played.success.tolist()
-        assert judged.flowtime.tolist() == played.flowtime.tolist()
-        assert judged.makespan.tolist() == played.makespan.tolist()
+        outcomes = pogema_methods.outcomes_of(instances, [each.paths for each in played.solutions], max_steps)
+        assert outcomes.success.tolist() == played.success.tolist()
+        assert outcomes.flowtime.tolist() == played.flowtime.tolist()
+        assert outcomes.makespan.tolist() == played.makespan.tolist()
     there_and_back = np.array([[(0, 0)], [(0, 1)], [(0, 2)], [(0, 1)], [(0, 1)]])
     alone = Instance(parse_map("..."), [(0, 0)], [(0, 1)])
     for max_steps, flowtime, success in ((1, 1, True), (2, 2, False), (3, 3, True), (9, 3, True)):
-        judged = pogema_methods.judge([alone], [there_and_back], max_steps)
-        assert (judged.flowtime.tolist(), judged.success.tolist()) == ([flowtime], [success])
+        outcomes = pogema_methods.outcomes_of([alone], [there_and_back], max_steps)
+        assert (outcomes.flowtime.tolist(), outcomes.success.tolist()) == ([flowtime], [success])
 
 
 def test_lifelong_play_counts_arrivals_at_the_goals_that_pogema_draws(folder: Path, tmp_path: Path) -> None:

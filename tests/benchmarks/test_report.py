@@ -91,7 +91,7 @@ def test_a_run_that_was_not_evaluated_has_its_curves(run: Path, tmp_path: Path) 
     assert "python -m gnn_policy.evaluate RUN" in (tmp_path / "other.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(("arguments", "words"), [(["none"], "none is no run folder"), ([], "at least one run")])
+@pytest.mark.parametrize(("arguments", "words"), [(["none"], "none is not a run folder"), ([], "at least one run")])
 def test_a_mistake_takes_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
     done = report(*arguments, folder=tmp_path)
     assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""Laws of the teachers' public calls: whatever is wrong with an argument, the message names it."""
+"""Public calls of the solvers: the message names the wrong argument."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -94,7 +94,7 @@ CALLS: dict[str, Any] = {
 
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is read, in the working folder."""
+    """Write the files that are read to the working folder."""
     monkeypatch.chdir(tmp_path)
     experts.save_paths("a.paths", SOLUTION)
 

@@ -148,7 +148,7 @@ def test_arguments_are_checked_before_the_first_result() -> None:
         (stays, r"solver \S*test_many\.stays .* agent 0 ends at \(\d+, \d+\), not .*, and \d+ more"),
         (Jumper(), r"solver \S*test_many\.Jumper .* agent 0 jumps in step 0, and \d+ more"),
         (partial(elsewhere, shift=1), r"solver \S*test_many\.elsewhere .* agent 0 starts at"),
-        (through_walls, r"solver \S*test_many\.through_walls .* which is no free cell"),
+        (through_walls, r"solver \S*test_many\.through_walls .* which is not a free cell"),
         (lambda _: Result.of(Solution(np.zeros((1, 1, 2), np.int32))), "1 paths for 8 agents"),
         (
             lambda instance: Result.of(Solution(np.stack([instance.starts, instance.starts[::-1], instance.goals]))),

@@ -1,4 +1,4 @@
-"""What the searches for hard instances promise: optimality, bounds and plans, judged by plain Python."""
+"""Optimality, bounds and plans of the searches for hard instances, checked by plain Python."""
 
 from __future__ import annotations
 

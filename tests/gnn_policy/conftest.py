@@ -1,4 +1,4 @@
-"""The pupil's tests run on one thread."""
+"""The tests of gnn_policy run on one thread."""
 
 import pytest
 import torch

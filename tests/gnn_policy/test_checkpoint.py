@@ -141,9 +141,9 @@ def damage(file, how):
             with_metadata(file, format="mapf-env policy 3")
         case "without settings":
             file.write_bytes(safetensors.torch.save(safetensors.torch.load(content), {"format": checkpoint.FORMAT}))
-        case "settings are no JSON":
+        case "settings are not JSON":
             with_metadata(file, policy="{")
-        case "settings are no table":
+        case "settings are not a table":
             with_metadata(file, policy="null")
         case "unknown setting":
             with_metadata(file, policy=json.dumps({**settings, "layers": 7}))
@@ -152,7 +152,7 @@ def damage(file, how):
         case "without execution":
             notes = {name: value for name, value in checkpoint.about(file).items() if name != "execution"}
             file.write_bytes(safetensors.torch.save(safetensors.torch.load(content), notes))
-        case "execution is no table":
+        case "execution is not a table":
             with_metadata(file, execution="[1]")
         case "unknown execution":
             with_metadata(file, execution=json.dumps({"patience": 2}))
@@ -180,12 +180,12 @@ DAMAGES = [
     "foreign",
     "later format",
     "without settings",
-    "settings are no JSON",
-    "settings are no table",
+    "settings are not JSON",
+    "settings are not a table",
     "unknown setting",
     "bad setting",
     "without execution",
-    "execution is no table",
+    "execution is not a table",
     "unknown execution",
     "bad execution",
     "other size",

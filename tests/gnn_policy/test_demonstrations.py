@@ -80,7 +80,7 @@ def rows_of(states, t):
 
 
 def seen_in_play(grids, states, t, config):
-    """What the PettingZoo environment shows to the robots of state t, by name."""
+    """Return the observation of the PettingZoo environment in state t, by agent."""
     rows, grid = rows_of(states, t), grids[states.maps[t]]
     case = Instance(grid, states.positions[rows].astype(np.int32), states.goals[rows].astype(np.int32))
     senses = {**config.senses(), "comm_radius": float(states.comm_radius[t])}

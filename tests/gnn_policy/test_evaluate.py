@@ -41,7 +41,7 @@ def file(tmp_path):
 
 
 def evaluated(monkeypatch, *arguments):
-    """What the command would evaluate, and how."""
+    """Return the settings, the folder and the options with which the command would evaluate."""
     calls = []
     monkeypatch.setattr(
         evaluation_report,

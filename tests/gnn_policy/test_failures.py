@@ -117,8 +117,8 @@ def test_it_is_the_definition_whatever_the_order_of_robots_and_the_side_of_the_m
     assert failure(turned, Solution(np.array(paths)[:, order, ::-1])) == kind
 
 
-def judged(instances, solutions):
-    """Rollouts as `rollout` would judge these paths, with T_max 40."""
+def played_as(instances, solutions):
+    """Return the `Rollouts` of these paths, with T_max 40."""
     on_goal = [(each.paths[-1] == case.goals).all(axis=1) for case, each in zip(instances, solutions, strict=True)]
     times = [np.where(there, each.arrivals, 40) for there, each in zip(on_goal, solutions, strict=True)]
     nothing = np.zeros(len(instances))
@@ -144,7 +144,7 @@ def test_the_worst_of_each_kind_come_first_beside_the_experts_solutions():
     one_fails = walked(plain, "RR" + 46 * "I", "I")
     both_fail = walked(plain, "I", "I")
     one_swings = walked(plain, "RR" + 46 * "I", "RL")
-    played = judged([plain] * 5, [straight, one_fails, slow, both_fail, one_swings])
+    played = played_as([plain] * 5, [straight, one_fails, slow, both_fail, one_swings])
     scenes = worst(played, [straight] * 5, 4)
     assert [scene.title for scene in scenes] == [
         "2 robots, case 3: deadlock, 2 not on goal, flowtime +1900%",

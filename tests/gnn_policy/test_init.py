@@ -1,4 +1,4 @@
-"""Importing the pupil where its libraries are missing."""
+"""Importing gnn_policy without its libraries."""
 
 import os
 import subprocess

@@ -151,7 +151,7 @@ def test_a_solver_that_answers_another_question_is_found_out(cases, monkeypatch)
         ({"solver": "experts:__all__"}, "'experts:__all__' is not a function or class but list"),
     ],
 )
-def test_a_teacher_that_cannot_teach_is_refused(cases, settings, message):
+def test_an_unknown_expert_is_refused(cases, settings, message):
     with pytest.raises(ValueError, match=message):
         labeller_for(cases, **settings)
 
@@ -199,7 +199,7 @@ def test_a_random_order_is_a_function_of_the_state(crowded):
     assert 0.1 < np.mean(told_apart) < 0.9
 
 
-def test_the_teacher_reports_how_long_it_took(cases):
+def test_the_labeller_measures_its_time(cases):
     times = iter(range(0, 1000, 5))
     labeller = labeller_for(cases, solver="pibt", clock=lambda: next(times))
     for asked in (1, 2, 3):

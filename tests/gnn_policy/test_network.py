@@ -1,4 +1,4 @@
-"""The network's laws: weights for any team, bags, symmetry between robots, and a reach of K - 1 hops."""
+"""Properties of the network: weights for any team, bags, symmetry between robots, and a reach of K - 1 hops."""
 
 import sys
 from collections import deque

@@ -1,4 +1,4 @@
-"""What a person sees of training."""
+"""The progress display of training."""
 
 import io
 

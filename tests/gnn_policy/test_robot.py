@@ -132,7 +132,7 @@ def test_attention_takes_its_softmax_over_the_messages_that_came(seed, count, lo
 @pytest.mark.parametrize("actions", ["argmax", "sampled", "stuck", "fallback"])
 @pytest.mark.parametrize(("taps", "graph_layer"), [(1, "filter"), (3, "filter"), (3, "attention")])
 def test_a_team_of_robots_walks_the_paths_of_rollout(taps, graph_layer, actions, weights):
-    """Views from the PettingZoo environment, actions to a slow world that shares only the shield."""
+    """Views from the PettingZoo environment, actions to a slow environment that shares only the shield."""
     execution = Execution(actions=actions, temperature=0.7)
     config = {"taps": taps, "graph_layer": graph_layer, "comm_radius": 3.0, "comm_weights": weights, **RICH}
     policy = seeded_policy(1, execution, **config)
@@ -206,7 +206,7 @@ def test_messages_survive_the_wire_and_nothing_else_is_taken_for_one():
 
 
 def test_a_lost_message_adds_nothing():
-    """Of two neighbours one is not heard: the sums have the other's share alone, over the degree of both."""
+    """One of two neighbours is not heard: the sums have the other's share alone, over the degree of both."""
     policy = seeded_policy(taps=2)
     robot, heard = Robot(policy), Message(np.arange(16, dtype=np.float32), False)
     view = np.random.default_rng(0).random((3, 7, 7), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Rollouts: what is executed never collides, and its judgement is that of a slow reader of the paths."""
+"""Rollouts: executed paths never collide, and their metrics equal those of a slow reader of the paths."""
 
 import sys
 import zlib
@@ -86,7 +86,7 @@ class ErraticActor(Blind):
 
 
 def cases_of(env):
-    """What tells the cases of an environment apart: size and goals, which do not change."""
+    """Return a key of each case of an environment: size and goals, which do not change."""
     sizes, goals = env.team_sizes, env.goals
     return [goals[b, : sizes[b]].astype(np.int32).tobytes() for b in range(env.num_envs)]
 
@@ -118,7 +118,7 @@ def assert_legal(instance, paths):
         assert oracles.faults(instance.grid, before, after) == []
 
 
-def slowly_judged(instance, paths, limit):
+def slowly_measured(instance, paths, limit):
     """Success, flowtime, makespan, share on goals and latched success, by walking along each path."""
     goals = [tuple(cell) for cell in instance.goals.tolist()]
     times, touched, at_home = [], [], 0
@@ -130,11 +130,11 @@ def slowly_judged(instance, paths, limit):
     return at_home == len(goals), sum(times), max(times), at_home / len(goals), all(touched)
 
 
-def assert_judged_rightly(played, limits):
+def assert_metrics_are_right(played, limits):
     for i, instance in enumerate(played.instances):
         paths = played.solutions[i].paths
         assert_legal(instance, paths)
-        success, flowtime, makespan, share, latched = slowly_judged(instance, paths, limits[i])
+        success, flowtime, makespan, share, latched = slowly_measured(instance, paths, limits[i])
         assert played.success[i] == success
         assert played.flowtime[i] == flowtime
         assert played.makespan[i] == makespan
@@ -151,12 +151,12 @@ def assert_judged_rightly(played, limits):
 
 @few
 @given(seed=st.integers(0, 2**32 - 1), num_agents=st.integers(1, 9))
-def test_nothing_executed_collides_and_the_judgement_is_right(seed, num_agents):
+def test_nothing_executed_collides_and_the_metrics_are_right(seed, num_agents):
     crowd = random_cases(seed, maps=3, num_agents=num_agents, height=3, width=4, density=0.1)
     limits = np.random.default_rng(seed).integers(1, 60, len(crowd))
     played = rollout(ErraticActor(seed), crowd, seed=seed, max_steps=limits)
     assert played.instances == crowd
-    assert_judged_rightly(played, limits)
+    assert_metrics_are_right(played, limits)
 
 
 class Plain(torch.nn.Module):
@@ -207,9 +207,9 @@ def test_a_policy_is_executed_in_its_own_way_unless_told_otherwise(cases, own):
 
 
 @pytest.mark.parametrize("actions", CHOICES)
-def test_the_policy_is_judged_like_any_actor(cases, policy, actions):
+def test_the_policy_is_measured_like_any_actor(cases, policy, actions):
     played = rollout(policy, cases, execution=Execution(actions=actions), max_steps=30, seed=2)
-    assert_judged_rightly(played, [30] * len(cases))
+    assert_metrics_are_right(played, [30] * len(cases))
     assert 0 < played.replaced.mean() < 1
 
 
@@ -248,7 +248,7 @@ def test_teams_and_maps_of_any_sizes_play_together_as_each_alone(mixed, config, 
         assert together.solutions[i].paths.shape[1:] == instance.starts.shape
         assert_legal(instance, together.solutions[i].paths)
     if task == "one_shot":
-        assert_judged_rightly(together, limits)
+        assert_metrics_are_right(together, limits)
 
 
 @pytest.mark.parametrize("actions", CHOICES)
@@ -362,7 +362,7 @@ def test_neither_batches_nor_neighbours_that_end_early_change_how_ties_are_broke
     crowd = random_cases(num_agents=9, maps=8, height=4, width=4, density=0.0)
     limits = np.arange(len(crowd)) % 5 + 8
     one = rollout(CrowdingActor(), crowd, max_steps=limits, seed=3)
-    assert_judged_rightly(one, limits)
+    assert_metrics_are_right(one, limits)
     for size in (1, 5):
         other = rollout(CrowdingActor(), crowd, max_steps=limits, seed=3, batch_size=size)
         assert all(same(one, other, i, i) for i in range(len(crowd)))
@@ -513,8 +513,8 @@ def test_the_share_of_replaced_actions():
     assert played.replaced[0] == pytest.approx(2 / 3)
     assert played.flowtime[0] == 18
     larger = Instance(np.zeros((1, 9), bool), [[0, 0], [0, 2], [0, 4], [0, 6]], [[0, 8], [0, 7], [0, 5], [0, 6]])
-    beside = rollout(Pushing(), [face_to_face, larger], max_steps=6)
-    assert beside.replaced[0] == played.replaced[0], "robots that are not there are not counted"
+    together = rollout(Pushing(), [face_to_face, larger], max_steps=6)
+    assert together.replaced[0] == played.replaced[0], "robots that are not there are not counted"
 
 
 def test_goals_that_are_left_again_do_not_count():

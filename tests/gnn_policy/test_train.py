@@ -182,7 +182,7 @@ def test_a_finished_run_is_not_trained_over(tmp_path, capsys):
     assert capsys.readouterr().err.startswith(f"error: {tmp_path} holds a run with other settings (seed)")
 
 
-def test_a_teacher_whose_plans_are_wrong_stops_training_with_its_name_and_fault(tmp_path, monkeypatch, capsys):
+def test_an_expert_with_wrong_plans_stops_training_with_its_name_and_fault(tmp_path, monkeypatch, capsys):
     module = ModuleType("lazy")
     exec(
         "import numpy as np, experts, mapf_env\n"

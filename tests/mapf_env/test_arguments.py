@@ -1,4 +1,4 @@
-"""Laws of the world's public calls: whatever is wrong with an argument, the message names it."""
+"""Public calls of mapf_env: the message names the wrong argument."""
 
 import math
 from collections.abc import Callable
@@ -326,7 +326,7 @@ CALLS: dict[str, Any] = {
 
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is read, in the working folder."""
+    """Write the files that are read to the working folder."""
     monkeypatch.chdir(tmp_path)
     mapf_env.save_map("a.map", GRID)
     mapf_env.save_scen("a.scen", INSTANCE, "a.map")

@@ -1,4 +1,4 @@
-"""Laws of drawn maps."""
+"""Maps drawn as text."""
 
 import pytest
 from hypothesis import given
@@ -29,7 +29,7 @@ def test_maps_are_read_back(grid: oracles.Grid) -> None:
 
 @given(strategies.instances(max_agents=5))
 def test_rendered_text_is_read_back(instance: Instance) -> None:
-    """Where no robot stands on a goal, its own or another's."""
+    """Instances in which no robot stands on a goal, its own or another's."""
     if not set(oracles.cells(instance.starts)) & set(oracles.cells(instance.goals)):
         assert parse_instance(text(instance.grid, instance.starts, instance.goals)) == instance
 

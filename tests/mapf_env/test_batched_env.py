@@ -1,4 +1,4 @@
-"""Laws of the batched environment: every executed step is judged, batches equal singles, seeds decide everything."""
+"""The batched environment: every executed step is checked, batches equal single environments, seeds decide all."""
 
 import copy
 import pickle

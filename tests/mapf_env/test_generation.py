@@ -1,4 +1,4 @@
-"""Laws of the random maps and instances."""
+"""Properties of random maps and instances."""
 
 from typing import Any, Literal
 
@@ -125,14 +125,14 @@ def test_placement_is_uniform_over_the_free_cells() -> None:
 
 @pytest.mark.parametrize("style", STYLES)
 def test_where_robots_stand_says_nothing_about_the_map_of_the_same_seed(style: Style) -> None:
-    """Robots start beside obstacles as often as chance has it: map and placement draw from streams of their own."""
+    """Robots start next to obstacles as often as by chance: map and placement have separate random streams."""
     seeds = np.arange(4000)
     grids = random_maps(seeds, style=style)
     padded = np.pad(grids, ((0, 0), (1, 1), (1, 1))).astype(float)
-    beside = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
-    chance = (beside * ~grids).sum() / (~grids).sum()
+    neighbours = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
+    chance = (neighbours * ~grids).sum() / (~grids).sum()
     for cells in random_cases(seeds, grids, 10):
-        seen = beside[np.arange(len(seeds))[:, None], cells[..., 0], cells[..., 1]].mean(axis=0)
+        seen = neighbours[np.arange(len(seeds))[:, None], cells[..., 0], cells[..., 1]].mean(axis=0)
         assert np.abs(seen - chance).max() < 0.06  # five standard errors
 
 

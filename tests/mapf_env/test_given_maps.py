@@ -1,4 +1,4 @@
-"""Laws of environments that play on a given map, or given cases, and of settings that do not exist."""
+"""Environments on a given map or given cases, and errors for unknown settings."""
 
 from collections.abc import Callable
 from typing import Any

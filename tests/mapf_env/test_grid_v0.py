@@ -1,4 +1,4 @@
-"""Laws of the PettingZoo view: PettingZoo's own tests and ours beside them."""
+"""The PettingZoo environment under PettingZoo's own tests and ours."""
 
 import copy
 import pickle

@@ -1,4 +1,4 @@
-"""Laws of the problem: what cannot be solved in principle cannot be built."""
+"""Instances: invalid ones cannot be constructed."""
 
 import copy
 import pickle

@@ -1,4 +1,4 @@
-"""Laws of instance sets: they round-trip, a change is noticed, and no file brings anything but a ValueError."""
+"""Instance sets: they round-trip, a change is noticed, and no file brings anything but a ValueError."""
 
 import hashlib
 import json

@@ -25,7 +25,7 @@ OPTIONS: dict[str, Any] = {
 
 
 class Heap(ctypes.Structure):
-    """What glibc's mallinfo2 returns."""
+    """The structure that glibc's mallinfo2 returns."""
 
     _names = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "used", "free", "keepcost")
     _fields_ = [(name, ctypes.c_size_t) for name in _names]

@@ -40,7 +40,7 @@ def steps_from(grid, start):
 
 @pytest.fixture
 def files(tmp_path):
-    """Writes a map and a scenario beside it and returns the scenario's path."""
+    """Write a map and a scenario next to it, and return the scenario's path."""
 
     def write(scen=SCEN, map_text=MAP):
         (tmp_path / "a.map").write_bytes(map_text.encode())
@@ -276,7 +276,7 @@ def test_a_missing_map_says_where_it_was_expected(files, tmp_path):
     scen = files()
     (tmp_path / "a.map").unlink()
     with pytest.raises(
-        FileNotFoundError, match=r"a\.scen, line 2 names the map 'a\.map', which is not beside it: put it there or"
+        FileNotFoundError, match=r"a\.scen, line 2 names the map 'a\.map', which is not next to it: put it there or"
     ):
         load_scen(scen)
 

@@ -1,4 +1,4 @@
-"""Laws of bags: what teams of any sizes on maps of any sizes perceive together is what they perceive alone."""
+"""Bags: what teams of any sizes on maps of any sizes perceive together is what they perceive alone."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Laws of all readers of files: sound files are read, and damaged ones are read soundly or refused with their place."""
+"""All readers of files: sound files are read, and damaged ones are read soundly or refused with their place."""
 
 from pathlib import Path
 

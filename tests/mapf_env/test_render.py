@@ -43,7 +43,7 @@ def elements(svg, tag, kind=None):
 
 
 def value_at(element, attribute, seconds):
-    """What `attribute` of an element is at a time, by the rules of SVG's animation, as a list of numbers."""
+    """Return an attribute of an element at a time, by the rules of SVG animation, as a list of numbers."""
     still = element.get(attribute, "").removeprefix("translate(").removesuffix(")")
     changes = [e for e in element if e.get("attributeName") == attribute]
     if not changes:

@@ -104,7 +104,7 @@ def test_the_page_plays_pauses_scrubs_and_tells_what_a_robot_knows(tmp_path: Pat
         "step 0 of 40, 2 of 3 on goal; robot 0 at (0,0), goal (0,2), hears 1",
         "step 40 of 40, 3 of 3 on goal; robot 0 at (0,2), goal (0,2), hears 1",
     ]
-    assert told["played"] == pytest.approx(5), "it has begun anew and plays five steps a second"
+    assert told["played"] == pytest.approx(5), "it has started again and plays five steps per second"
     assert told["frames"] == 50
     assert told["paused"] == told["played"]
 

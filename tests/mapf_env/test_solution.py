@@ -1,4 +1,4 @@
-"""Laws of the answer: its cost and the audit of its faults."""
+"""The cost of a solution, and the audit of its faults."""
 
 import pickle
 import tracemalloc
@@ -100,8 +100,8 @@ def test_violations_name_agent_cell_and_time() -> None:
     assert path.violations(instance) == [
         "agent 0 starts at (0, 1), not (0, 0)",
         "agent 0 ends at (0, 0), not (0, 1)",
-        "agent 0 is at (0, 2) at time 1, which is no free cell",
-        "agent 0 is at (0, 3) at time 2, which is no free cell",
+        "agent 0 is at (0, 2) at time 1, which is not a free cell",
+        "agent 0 is at (0, 3) at time 2, which is not a free cell",
         "agent 0 jumps in step 2",
     ]
     assert Solution(np.zeros((1, 2, 2), int)).violations(instance) == ["2 paths for 1 agents"]
