@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import os
 import sys
+import textwrap
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import is_dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
 
 if TYPE_CHECKING:
     from gnn_policy.network import DecentralizedPolicy
@@ -17,21 +22,21 @@ DEBUG = "--debug"
 
 
 def run_command(
-    parse: Callable[[Sequence[str]], C], work: Callable[[C], None], arguments: Sequence[str] | None = None
-) -> None:
-    """Parse the arguments of a command and do its work, with errors as in `cli_errors`.
+    parse: Callable[[Sequence[str]], C], work: Callable[[C], int | None], arguments: Sequence[str] | None = None
+) -> int:
+    """Parse the arguments of a command, do its work and return its exit status, with errors as in `cli_errors`.
 
     Args:
         parse: Makes a command of its arguments; may end the process, as for `--help`.
-        work: Does what the command asks for. If code that it calls ends the process with status 0, such as a module of
-            the user's own with `sys.exit()`, that is an error: the work has not been done.
+        work: Does what the command asks for and returns the exit status; None means 0. If code that it calls ends the
+            process with status 0, such as a user's module with `sys.exit()`, that is an error: the work is not done.
         arguments: The arguments; `sys.argv[1:]` if not given.
     """
     given = sys.argv[1:] if arguments is None else arguments
     with cli_errors(debug=DEBUG in given):
         command = parse(given)
         try:
-            work(command)
+            return work(command) or 0
         except SystemExit as end:
             if end.code in (0, None):
                 raise RuntimeError(
@@ -39,6 +44,38 @@ def run_command(
                     "remove sys.exit() and SystemExit from your own module"
                 ) from end
             raise
+
+
+def parse_options(kind: type[C], arguments: Sequence[str], **settings: Any) -> C:
+    """Parse the options of a dataclass with tyro; an option's help is its field's docstring as one paragraph.
+
+    Args:
+        kind: The dataclass.
+        arguments: The arguments of the command.
+        settings: Keyword arguments of `tyro.cli`.
+    """
+    import tyro
+
+    _flow_help(kind)
+    return tyro.cli(kind, args=arguments, **settings)
+
+
+def _flow_help(kind: type) -> None:
+    """Annotate the fields of a dataclass and of those within it with their docstrings; tyro keeps their line breaks."""
+    import tyro
+
+    for each in kind.__mro__[:-1]:
+        (body,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
+        assignments = pairwise(body.body if isinstance(body, ast.ClassDef) else [])
+        hints = get_type_hints(each, include_extras=True)
+        for before, after in assignments:
+            match before, after:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    flowing = tyro.conf.arg(help=" ".join(text.split()))
+                    each.__annotations__[name] = Annotated[hints[name], flowing]
+        for inner in get_type_hints(each).values():
+            if is_dataclass(inner):
+                _flow_help(cast(type, inner))
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from gnn_policy import checkpoint
 from gnn_policy.cases import Task
-from gnn_policy.command_line import run_command
+from gnn_policy.command_line import parse_options, run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
 from gnn_policy.results_file import default_executions, refuse_other_settings, settings_of
@@ -35,10 +35,10 @@ class Command:
     executions: tuple[str, ...] | None = None
     """Executions of the policy, one row in the table for each. An execution is words joined by commas: "argmax",
     "sampled", "stuck" (stuck robots and their neighbours sample) or "fallback" (stuck robots follow their shortest
-    path); a temperature for the latter three; the shield "idle", "pibt" or "pibt_swap"; the communication range "fixed"
-    or "connected" (the radius grows until the team is connected); the edge weights "binary" or "distance". Anything left
-    out is as in the policy's own execution. If not given: argmax, stuck and sampled, or fallback and argmax for a policy
-    whose own execution is "fallback"."""
+    path); a temperature for the latter three; the shield "idle", "pibt" or "pibt_swap"; the communication range
+    "fixed" or "connected" (the radius grows until the team is connected); the edge weights "binary" or "distance".
+    Anything left out is as in the policy's own execution. If not given: argmax, stuck and sampled, or fallback and
+    argmax for a policy whose own execution is "fallback"."""
     split: Literal["validation", "test"] = "test"
     """Which maps: "validation" to choose an execution, "test" to report it."""
     maps: int | None = None
@@ -87,7 +87,7 @@ class Command:
 
 def parse(arguments: Sequence[str]) -> Command:
     """Return the command that the arguments ask for."""
-    return tyro.cli(Command, args=arguments, prog="python -m gnn_policy.evaluate")
+    return parse_options(Command, arguments, prog="python -m gnn_policy.evaluate")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from rich.console import Console
 
 from gnn_policy import checkpoint
 from gnn_policy.cases import Task
-from gnn_policy.command_line import run_command
+from gnn_policy.command_line import parse_options, run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
 from mapf_env import EnvConfig, Instance, Scene, distances, replay_scenes
@@ -30,11 +31,15 @@ PATIENCE = 4
 
 @dataclass(frozen=True)
 class Command:
-    """Play a policy on a map of your own and write a page that replays it in any browser."""
+    """Play a policy on your own map and write a page that replays it in any browser.
+
+    The exit status is 0 if all robots of every team reach their goals, 1 if a team fails, and 2 after an error.
+    """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """A map (.map) in the MovingAI format, a scenario (.scen) next to its map, a set of instances (.json), maps of
-    POGEMA (.yaml), or a folder of these."""
+    """A map (.map) in the MovingAI format, a drawing (.txt) with # for obstacles and . for free cells, a scenario
+    (.scen) next to its map, a set of instances (.json), maps of POGEMA (.yaml), or a folder of these without
+    drawings."""
     agents: int | None = None
     """Number of robots: placed at random on a map, or the first ones of a file with robots (all of them if not
     given)."""
@@ -68,15 +73,15 @@ class Command:
 
 def parse(arguments: Sequence[str]) -> Command:
     """Return the command that the arguments ask for."""
-    return tyro.cli(Command, args=arguments, prog="python -m gnn_policy.play")
+    return parse_options(Command, arguments, prog="python -m gnn_policy.play")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command."""
-    run_command(parse, _play, arguments)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns 0 if every team has reached its goals (always in lifelong tasks), else 1."""
+    return run_command(parse, _play, arguments)
 
 
-def _play(command: Command) -> None:
+def _play(command: Command) -> int:
     """Check everything that needs no torch, then play."""
     threads = cpu_threads(command.threads)
     execution = checkpoint.executed_as(command.policy)
@@ -127,6 +132,7 @@ def _play(command: Command) -> None:
         console.print(scene.title, highlight=False)
     console.print(f"{title} ({seconds:.1f} s)", highlight=False)
     console.print(f"replay: {out}", highlight=False, soft_wrap=True)
+    return 0 if command.task == "lifelong" or played.success.all() else 1
 
 
 def _problems(command: Command) -> dict[str, Instance]:
@@ -176,4 +182,4 @@ def _patience(instance: Instance) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from gnn_policy import checkpoint
-from gnn_policy.command_line import run_command
+from gnn_policy.command_line import parse_options, run_command
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
 from gnn_policy.recipes import RECIPES, Recipe
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class Command:
     """Train a decentralized policy by imitating an ECBS expert, then evaluate it on held-out maps.
 
-    A killed run goes on where it stopped when the same command is given again. Several processes share the work, on one
-    machine or more, when torchrun starts them: `torchrun --nproc-per-node 2 -m gnn_policy.train -- --run runs/two`.
+    A killed run resumes when the same command is given again. Several processes share the work, on one machine or more,
+    when torchrun starts them: `torchrun --nproc-per-node 2 -m gnn_policy.train -- --run runs/two`.
     """
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
@@ -37,8 +37,8 @@ class Command:
     the paper's models that come with the package, "paper" is the paper's setup, "general" makes the policy for any map
     and crowds of robots in hours."""
     file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
-    """A file of settings, such as the config.toml of another run, instead of a recipe; settings that are not there have
-    the defaults of "paper"."""
+    """A file of settings, such as the config.toml of another run, instead of a recipe; missing settings have the
+    defaults of "paper"."""
     run: Path | None = None
     """The run folder; runs/RECIPE, or runs/ and the name of the file of settings, if not given."""
     debug: bool = False
@@ -64,8 +64,8 @@ def parse(arguments: Sequence[str]) -> Command:
         config = replace(
             config, policy=checkpoint.config_of(chosen.init), execution=checkpoint.executed_as(chosen.init)
         )
-    command = tyro.cli(
-        Command, args=arguments, default=Command(config, chosen.recipe, chosen.file), prog="python -m gnn_policy.train"
+    command = parse_options(
+        Command, arguments, default=Command(config, chosen.recipe, chosen.file), prog="python -m gnn_policy.train"
     )
     _refuse_unused(command.config, config)
     return command

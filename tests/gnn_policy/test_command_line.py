@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig
+from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, play, train
 from gnn_policy.command_line import cli_errors, on_device, run_command
 
 
@@ -115,3 +115,18 @@ def test_arguments_are_read_before_heavy_libraries_are_loaded(tmp_path, command,
     done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == (0 if arguments == ["--help"] else 2), done.stderr
     assert done.stdout.splitlines()[-1].split() == ["loaded"]
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        (play, "with # for obstacles and . for free cells, a scenario (.scen) next to its map"),
+        (evaluate, "If not given: argmax, stuck and sampled, or fallback and argmax for a policy"),
+        (train, "it also takes the network, its senses and its execution from there"),
+    ],
+)
+def test_the_help_of_an_option_is_one_paragraph(capsys, monkeypatch, command, sentence):
+    monkeypatch.setenv("COLUMNS", "2000")
+    with pytest.raises(SystemExit):
+        command.main(["--help"])
+    assert sentence in capsys.readouterr().out

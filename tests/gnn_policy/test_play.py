@@ -1,16 +1,17 @@
-"""The command that plays a policy on a map of one's own and writes a page."""
+"""The command that runs a policy on your own map and writes a page."""
 
 import json
 import re
 import sys
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 import torch
 
 import oracles
 from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, play, rollout, save
-from mapf_env import load_scen, random_instance, save_instances, save_map, save_scen
+from mapf_env import load_scen, parse_map, random_instance, save_instances, save_map, save_scen
 
 LIFELONG = ["--task", "lifelong", "--execution", "argmax", "--max-steps", "9"]
 
@@ -32,7 +33,7 @@ def home(tmp_path, monkeypatch):
 
 
 def played(*arguments):
-    play.main([*arguments, "--policy", "policy.safetensors", "--threads", "1"])
+    return play.main([*arguments, "--policy", "policy.safetensors", "--threads", "1"])
 
 
 def shown(path):
@@ -138,6 +139,39 @@ def test_a_team_that_is_home_has_solved_it(home, capsys):
     save_scen("rest.scen", instance.at(instance.goals), "own.map")
     played("rest.scen")
     assert "6 on goal after 0 steps, flowtime 0" in capsys.readouterr().out
+
+
+def test_a_drawing_is_played_with_its_own_robots_or_with_random_ones(home):
+    Path("own.txt").write_text("A..a\n.##.\nb..B\n")
+    played("own.txt", "--max-steps", "3", "--out", "drawn.html")
+    (scene,) = shown(home / "drawn.html")["scenes"]
+    assert scene["goals"] == [[0, 3], [2, 0]]
+    assert scene["panels"][0]["paths"][0] == [[0, 0], [2, 3]]
+    played("own.txt", "--agents", "1", "--max-steps", "3", "--out", "first.html")
+    assert shown(home / "first.html")["scenes"][0]["goals"] == [[0, 3]]
+    Path("plain.txt").write_text("....\n.##.\n....\n")
+    played("plain.txt", "--agents", "3", "--seed", "5", "--max-steps", "3")
+    expected = random_instance(grid=parse_map("....\n.##.\n...."), num_agents=3, seed=5)
+    assert shown(home / "plain.html")["scenes"][0]["goals"] == expected.goals.tolist()
+
+
+@pytest.mark.parametrize(
+    ("drawing", "words"), [("..\n.", "line 2 has 1 cells"), ("Aa\nb.", "goal b"), ("..", "--agents N")]
+)
+def test_a_drawing_that_cannot_be_played_is_refused(home, capsys, drawing, words):
+    Path("bad.txt").write_text(drawing)
+    with pytest.raises(SystemExit) as end:
+        played("bad.txt")
+    assert end.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+def test_the_exit_status_tells_success(home):
+    instance = load_scen("own.scen")
+    save_scen("rest.scen", instance.at(instance.goals), "own.map")
+    assert played("rest.scen") == 0
+    assert played("own.scen", "--max-steps", "1") == 1
+    assert played("own.scen", "--max-steps", "1", "--task", "lifelong") == 0
 
 
 @pytest.mark.parametrize(
