@@ -3,7 +3,7 @@
     python benchmarks/generalist.py runs/general
     python benchmarks/generalist.py runs/general --executions stuck,0.5,pibt sampled,0.5,pibt --sizes 32 64
 
-The maps are random, with the statistics of POGEMA's sets "random" and "mazes": 17 to 21 cells a side, 128 steps. A
+The maps are random, with the statistics of POGEMA's sets "random" and "mazes": 17 to 21 cells per side, 128 steps. A
 policy never trains on them, for they belong to the validation split. SoC is the sum of the last arrivals; a robot that
 is off its goal at the end counts all steps. Greedy robots under the PIBT shields are the baselines.
 """

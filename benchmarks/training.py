@@ -166,7 +166,7 @@ def parts_of_a_round() -> None:
         ("round", fit + collect),
     ):
         print(f"{name:26} {seconds:7.2f} s  {seconds / steps:6.1%} of the gradient steps")
-    print(f"{states / (fit + collect):,.0f} robot states a second, all in")
+    print(f"{states / (fit + collect):,.0f} robot states per second, all in")
 
 
 def speed_of_steps() -> None:
@@ -182,7 +182,7 @@ def speed_of_steps() -> None:
                     with_library_convolutions(policy)
                 rate = config.batch_size * config.num_agents / median_seconds(gradient_step(policy, config))
                 kind = "the library's convolutions" if library else "products of matrices"
-                print(f"{encoder:9} {kind:27} {precision:9} {rate:9,.0f} robot states a second", flush=True)
+                print(f"{encoder:9} {kind:27} {precision:9} {rate:9,.0f} robot states per second", flush=True)
 
 
 def with_library_convolutions(policy: DecentralizedPolicy) -> None:
@@ -219,7 +219,7 @@ def threads_and_processes() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for processes, threads in ((1, 1), (1, 2), (2, 1)):
             rate = fitted(Path(folder, f"{processes}-{threads}"), processes, threads)
-            print(f"{processes} processes, {threads} threads each: {rate:,.0f} robot states a second", flush=True)
+            print(f"{processes} processes, {threads} threads each: {rate:,.0f} robot states per second", flush=True)
 
 
 def seconds_of_a_round(run: Path, *options: str) -> float:

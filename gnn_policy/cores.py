@@ -12,22 +12,22 @@ CGROUPS = Path("/sys/fs/cgroup")
 OWN_CGROUPS = Path("/proc/self/cgroup")
 
 
-def cpu_threads(asked: int, processes: int = 1) -> int:
-    """Return the number of threads asked for, or for 0 as many as the process may use.
+def cpu_threads(requested: int, processes: int = 1) -> int:
+    """Return the number of threads requested, or for 0 as many as the process may use.
 
     The latter is the least of the affinity mask's cores, the quota of its cgroups (version 1 or 2) and OMP_NUM_THREADS.
 
     Args:
-        asked: A number, or 0.
+        requested: The number of threads, or 0.
         processes: How many processes of this program share the cores.
 
     Raises:
         ValueError: If the number is out of range.
     """
-    if not 0 <= asked <= MOST_THREADS:
-        raise ValueError(f"threads must lie in 0..{MOST_THREADS}, got {asked}")
-    if asked > 0:
-        return asked
+    if not 0 <= requested <= MOST_THREADS:
+        raise ValueError(f"threads must lie in 0..{MOST_THREADS}, got {requested}")
+    if requested > 0:
+        return requested
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     cores = int(min(cores, _cgroup_quota()))
     first = re.match(r"\s*(\d+)", os.environ.get("OMP_NUM_THREADS", ""))  # "4,2" is for nested regions

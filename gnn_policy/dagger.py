@@ -194,8 +194,10 @@ class Demonstrator:
             states = states_of(chosen, self._map_of)
             weight = np.where(np.logical_or.reduceat(states.stuck(), states.offsets[:-1]), config.stuck_weight, 1.0)
             count = max(len(states) // config.plan_steps, 1)
-            asked = np.random.default_rng(seed).choice(len(states), count, replace=False, p=weight / weight.sum())
-            return self._labeller.demonstrate(states.take(np.sort(asked)), config.plan_steps)
+            chosen_starts = np.random.default_rng(seed).choice(
+                len(states), count, replace=False, p=weight / weight.sum()
+            )
+            return self._labeller.demonstrate(states.take(np.sort(chosen_starts)), config.plan_steps)
         return self._labeller.label(states_of(chosen, self._map_of))
 
     def _starts(self, steps: int, rng: np.random.Generator) -> States:

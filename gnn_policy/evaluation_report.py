@@ -84,41 +84,41 @@ def evaluate_and_report(
     refuse_other_settings(numbers, settings, "--out")
     tables = read_tables(numbers)
     finished = set() if failures or tables.keys() >= cases.keys() else tables.keys() & cases.keys()
-    held_out = {name: each.cases(split, whole=whole).instances for name, each in cases.items() if name not in finished}
-    show = metrics.table if task == "one_shot" else metrics.lifelong_table
-    rivals = metrics.BASELINES if task == "one_shot" else metrics.LIFELONG_BASELINES
+    instances = {name: each.cases(split, whole=whole).instances for name, each in cases.items() if name not in finished}
+    make_table = metrics.table if task == "one_shot" else metrics.lifelong_table
+    baselines = metrics.BASELINES if task == "one_shot" else metrics.LIFELONG_BASELINES
     scenes: list[Scene] = []
     with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task("", total=len(held_out) * (len(executions) + len(rivals)))
+        bar = progress.add_task("", total=len(instances) * (len(executions) + len(baselines)))
         for name in cases:
             title = table_title(name, settings)
             if name in finished:
-                console.print(show(title, tables[name]))
+                console.print(make_table(title, tables[name]))
                 continue
 
             def advance(phase: str, title: str = title) -> None:
                 progress.update(bar, description=f"{title}: {phase}", advance=1)
 
             if task == "lifelong":
-                tables[name], shown = metrics.compare_lifelong(
-                    held_out[name], policy, executions, steps=steps, seed=config.seed, progress=advance
+                tables[name], rollouts = metrics.compare_lifelong(
+                    instances[name], policy, executions, steps=steps, seed=config.seed, progress=advance
                 )
             else:
                 progress.update(bar, description=f"{title}: expert")
                 reference = metrics.ReferenceSet.prepare(
-                    held_out[name], w=config.w, timeout=config.timeout, threads=threads, nodes=config.reference_nodes
+                    instances[name], w=config.w, timeout=config.timeout, threads=threads, nodes=config.reference_nodes
                 )
-                rows, shown = metrics.compare(reference, policy, executions, seed=config.seed, progress=advance)
+                rows, rollouts = metrics.compare(reference, policy, executions, seed=config.seed, progress=advance)
                 progress.advance(bar)
-                kinds = {each.name: count_failures(played) for each, played in zip(executions, shown, strict=True)}
+                kinds = {each.name: count_failures(played) for each, played in zip(executions, rollouts, strict=True)}
                 tables[name] = {**metrics.as_json(rows, reference), "failures": kinds}
                 if failures:
-                    scenes += worst(shown[0], reference.solutions, failures)
+                    scenes += worst(rollouts[0], reference.solutions, failures)
                     heading = f"The worst cases of {executions[0].name} next to the expert's solutions"
                     perceived = EnvConfig(**executions[0].env_settings(policy.config))
                     replay_scenes(scenes, folder / "failures.html", title=heading, config=perceived)
-            console.print(show(title, tables[name]))
-            _animate(shown, folder / "animation.svg")
+            console.print(make_table(title, tables[name]))
+            _animate(rollouts, folder / "animation.svg")
             write_tables(numbers, settings, tables)
     console.print(f"animation: {folder / 'animation.svg'}", highlight=False)
     if scenes:
@@ -126,14 +126,14 @@ def evaluate_and_report(
     console.print(f"numbers: {numbers}", highlight=False)
 
 
-def _animate(shown: Sequence[Rollouts], path: Path) -> None:
+def _animate(rollouts: Sequence[Rollouts], path: Path) -> None:
     """Write an animation of a case of the best execution."""
-    best = max(shown, key=lambda played: (played.success.mean(), played.throughput.mean()))
+    best = max(rollouts, key=lambda played: (played.success.mean(), played.throughput.mean()))
     case = _worth_watching(best)
     lifelong = len(best.goals[case]) > 1
     outcome = "all on goal" if best.success[case] else "timed out"
     if lifelong:
-        outcome = f"{best.throughput[case]:.2f} arrivals a step"
+        outcome = f"{best.throughput[case]:.2f} arrivals per step"
     title = f"Trained policy, {best.instances[case].num_agents} robots: {outcome}"
     goals = best.goals[case] if lifelong else None
     animate(best.instances[case], best.solutions[case], path, title=title, goals=goals)

@@ -175,8 +175,8 @@ class Labeller:
                 break
             here = here.take(np.isin(sources, labels.source[found]))
             sources = labels.source[found]
-            asked = order[states.rows(sources)]  # the robots in the order of the labels, as rows of the given states
-            place = asked - np.repeat(states.offsets[sources] - here.offsets[:-1], np.diff(here.offsets))
+            robots = order[states.rows(sources)]  # the robots in the order of the labels, as rows of the given states
+            place = robots - np.repeat(states.offsets[sources] - here.offsets[:-1], np.diff(here.offsets))
             rows = _rows_of(labels.offsets, found)
             actions = np.empty(here.num_robots, np.int8)
             positions = np.empty((here.num_robots, 2), np.int32)

@@ -168,10 +168,10 @@ def _outcome(task: Task, played: Rollouts, number: int) -> str:
     steps = len(solution.paths) - 1
     if task == "lifelong":
         return f"{size}: {played.throughput[number]:.2f} arrivals per step over {steps} steps"
-    home = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
+    on_goal = int((solution.paths[-1] == instance.goals).all(axis=1).sum())
     kind = failure(instance, solution)
     end = f"flowtime {solution.sum_of_costs}" if kind is None else f"failed: {kind}"
-    return f"{size}: {home} on goal after {steps} steps, {end}"
+    return f"{size}: {on_goal} on goal after {steps} steps, {end}"
 
 
 def _patience(instance: Instance) -> int:

@@ -131,13 +131,13 @@ def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) ->
     training = Training(config, folder, progress, ranks)
     console.print(f"run folder: {folder}", highlight=False)
     if training.history:
-        console.print(f"goes on after round {len(training.history)} of {config.rounds}", highlight=False)
+        console.print(f"resuming after round {len(training.history)} of {config.rounds}", highlight=False)
     with training.lock:
         try:
             with progress:
                 training.run()
         except KeyboardInterrupt:
-            console.print(f"stopped; the same command goes on after round {len(training.history)}", highlight=False)
+            console.print(f"stopped; the same command resumes after round {len(training.history)}", highlight=False)
             raise SystemExit(130) from None
         if ranks.rank > 0:
             return

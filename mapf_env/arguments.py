@@ -125,7 +125,7 @@ def shaped(
     """
     found, wanted = array(values, name), _axes(shape)
     pairs = zip(wanted, found.shape, strict=False)
-    fits = all(length == asked if asked is not None else length or not filled for asked, length in pairs)
+    fits = all(length == wanted if wanted is not None else length or not filled for wanted, length in pairs)
     if found.ndim != len(wanted) or not fits:
         raise ValueError(f"{name} must have shape {shape}{meaning}, got {found.shape}")
     return found

@@ -123,12 +123,12 @@ class BatchedEnv:
         if shape == (self.config.height, self.config.width):
             return self
         settings = {each.name: getattr(config, each.name) for each in fields(config)}
-        home = shape == (config.height, config.width)
-        if not home:
+        same_size = shape == (config.height, config.width)
+        if not same_size:
             settings |= {"height": shape[0], "width": shape[1], "density": 0.0, "style": "empty"}
         other = BatchedEnv(self.num_envs, threads=self.threads, autoreset=self.autoreset, **settings)
         other._home = self._home
-        if home:
+        if same_size:
             other._source = self._home
         for name in ("streams", "episodes", "started"):
             getattr(other._state, name)[:] = getattr(self._state, name)

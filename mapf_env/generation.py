@@ -40,7 +40,7 @@ class Walls:
     """Walls one cell thick that grow in steps of two cells; the style "walls" with its parts chosen.
 
     They fill a map up to its density and always leave the free cells connected. With `Walls(segments=4, straight=0.5,
-    ring=True)` on 17 to 21 cells a side, odd sizes, and densities of 0.1 to 0.4 the maps resemble POGEMA's mazes.
+    ring=True)` on 17 to 21 cells per side, odd sizes, and densities of 0.1 to 0.4 the maps resemble POGEMA's mazes.
 
     Raises:
         ValueError: If a part is out of its range.

@@ -37,7 +37,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         reuse_buffers: Return the same dictionaries and arrays at every step, overwritten; faster, for loops that store
             none of them.
         render_mode: "ansi" gives text, "rgb_array" a picture (H', W', 3), "human" prints the text at each step; in a
-            terminal each state replaces the one before, `metadata["render_fps"]` times a second.
+            terminal each state replaces the one before, `metadata["render_fps"]` times per second.
         cases: As in `BatchedEnv`.
         grid: As in `BatchedEnv`.
         settings: Fields of `mapf_env.EnvConfig`.
@@ -162,7 +162,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
             TypeError: If the seed is not an integer, `options` not a dictionary or `options["instance"]` not an
                 `Instance`.
         """
-        seed, instance = None if seed is None else arguments.seed(seed), instance_asked_for(options)
+        seed, instance = None if seed is None else arguments.seed(seed), instance_of_reset(options)
         if self._reuse and self._reused is None:
             self._reused = _Reused(self)
         reused = self._reused
@@ -296,7 +296,7 @@ def begun(
     return fitting
 
 
-def instance_asked_for(options: dict[str, Any] | None) -> Instance | None:
+def instance_of_reset(options: dict[str, Any] | None) -> Instance | None:
     """Return `options["instance"]` of a reset, if given; raises TypeError if it or `options` has the wrong type."""
     instance = None if options is None else arguments.instance_of(options, dict, "options").get("instance")
     return None if instance is None else arguments.instance_of(instance, Instance, 'options["instance"]')

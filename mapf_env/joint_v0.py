@@ -13,7 +13,7 @@ from gymnasium import spaces
 from mapf_env import arguments
 from mapf_env.batched_env import BatchedEnv, Observation
 from mapf_env.config import configured
-from mapf_env.grid_v0 import begun, instance_asked_for, observation_spaces
+from mapf_env.grid_v0 import begun, instance_of_reset, observation_spaces
 from mapf_env.instance import Instance
 from mapf_env.pixels import RENDER_MODES, RenderMode, Screen
 
@@ -62,7 +62,7 @@ class JointEnv(gymnasium.Env[Any, npt.NDArray[np.integer]]):
             TypeError: If the seed is not an integer, `options` not a dictionary or `options["instance"]` not an
                 `Instance`.
         """
-        seed, instance = None if seed is None else arguments.seed(seed), instance_asked_for(options)
+        seed, instance = None if seed is None else arguments.seed(seed), instance_of_reset(options)
         super().reset(seed=seed)
         observation = self._batch.buffers()
         self._batch = begun(self._batch, self.config, seed, instance, observation)

@@ -131,10 +131,10 @@ def _moving(
             _robot(i, loop[0, i], colour, drive if changing is not None or on_goal[-1, i] else warning + drive)
         )
 
-    told = [f"{count} of {len(robots)} on goal" for count in resting.sum(axis=1)]
+    captions = [f"{count} of {len(robots)} on goal" for count in resting.sum(axis=1)]
     if changing is not None:
         reached, there = (loop[1:] == aims[:-1]).all(axis=2), (loop[:-1] == aims[:-1]).all(axis=2)
-        told = [f"{count} arrivals" for count in np.cumsum([0, *(reached & ~there).sum(axis=1)])]
+        captions = [f"{count} arrivals" for count in np.cumsum([0, *(reached & ~there).sum(axis=1)])]
     left, right = _span(instance)
     line = _caption_line(instance)
     bar = f'x="{left}" y="{line - 19}" height="3" rx="1.5"'
@@ -148,7 +148,7 @@ def _moving(
         f'<rect {bar} width="0" fill="{_FAINT_INK}">{growth}</rect>',
         f'<clipPath id="{window}"><rect x="{left}" y="{line - 15}" width="{right - left}" height="20"/></clipPath>',
         f'<g clip-path="url(#{window})">',
-        _counter(clock, told, instance, "start"),
+        _counter(clock, captions, instance, "start"),
         _counter(clock, [f"step {now} of {steps}" for now in step], instance, "end"),
         "</g>",
     ]

@@ -45,7 +45,7 @@ def observe(
 ) -> npt.NDArray[Any]:
     """Return every robot's field of view, (B, N, 3, F, F), in the layout of the authors' code.
 
-    The inner window of 2 * fov_radius + 1 cells a side is the view, centred on the robot; the one-cell ring around it
+    The inner window of 2 * fov_radius + 1 cells per side is the view, centred on the robot; the one-cell ring around it
     carries only the goal when that is out of sight, projected along the line from the robot to it. Channels: obstacles
     (cells outside the map count), the robot's own goal (exactly one cell), all robots in view, itself included.
     Source: Li et al. 2020, r_FOV = 4 gives 3 x 11 x 11; the layout is that of the authors' code.

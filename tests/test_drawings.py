@@ -15,7 +15,7 @@ draw = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(draw)
 
 
-def test_the_files_are_what_the_script_draws() -> None:
+def test_the_files_match_the_script() -> None:
     drawn = draw.drawings()
     assert {path.stem for path in HOME.glob("*.svg")} == set(drawn)
     for name, picture in drawn.items():

@@ -24,7 +24,7 @@ def test_every_setting_is_listed_with_its_default() -> None:
     assert listed(SHARED) == {field.name: str(field.default) for field in fields(EnvConfig)}
 
 
-def test_what_one_interface_alone_takes_is_listed_with_its_default() -> None:
+def test_settings_of_one_interface_are_listed_with_their_defaults() -> None:
     taken = {
         name: getattr(parameter.default, "name", str(parameter.default))
         for interface in (GridEnv, BatchedEnv)

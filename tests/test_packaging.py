@@ -62,7 +62,7 @@ def test_importing_again_registers_nothing_twice() -> None:
     assert run_python(code) == "mapf/grid-v0 mapf/grid-v0"
 
 
-def test_a_source_tree_that_was_not_built_says_so(tmp_path: Path) -> None:
+def test_the_error_of_a_source_tree_that_is_not_built_says_so(tmp_path: Path) -> None:
     package = tmp_path / "mapf_env"
     package.mkdir()
     (package / "__init__.py").write_text((ROOT / "mapf_env" / "__init__.py").read_text())

@@ -70,7 +70,7 @@ def test_finished_runs_are_not_repeated_and_the_table_has_them_all(
         ablation.main(options("nonne"))
 
 
-def test_runs_of_other_settings_are_no_part_of_the_table(ablation: ModuleType, tmp_path: Path) -> None:
+def test_runs_of_other_settings_are_left_out_of_the_table(ablation: ModuleType, tmp_path: Path) -> None:
     ablation.main(ablation.Options("dagger", tmp_path, only=("none",), updates=1))
     with pytest.raises(FileExistsError, match=r"none-seed-0 holds a run of other settings \(updates_per_round\)"):
         ablation.main(ablation.Options("dagger", tmp_path, only=("default",), updates=2))
@@ -79,7 +79,7 @@ def test_runs_of_other_settings_are_no_part_of_the_table(ablation: ModuleType, t
 
 
 @pytest.mark.parametrize("ablation_name", ["LABELS", "DAGGER"])
-def test_every_variant_is_a_setting_of_its_own(ablation: ModuleType, ablation_name: str) -> None:
+def test_all_variants_have_different_settings(ablation: ModuleType, ablation_name: str) -> None:
     variants = getattr(ablation, ablation_name)
     configs = [replace(ablation.BASE, **settings) for settings in variants.values()]
     assert len({each.to_toml() for each in configs}) == len(configs)

@@ -27,7 +27,7 @@ def test_every_team_size_has_the_same_maps_which_look_like_those_of_pogema() -> 
         assert abs(blocked - {"random": 0.2, "mazes": 0.3}[name]) < 0.05
 
 
-def test_the_table_says_what_rollouts_say(
+def test_the_table_agrees_with_rollouts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(generalist, "STEPS", 20)

@@ -67,7 +67,7 @@ def test_figure_two_tests_every_k_on_its_own_size_and_figure_three_k_3_on_all(tm
     assert beyond == connected | {(f"20x20-cells-n{N}", "n12-k3-informed") for N in (4, 6, 8, 10, 12, 14)}
 
 
-def test_models_are_drawn_from_on_teams_of_their_own_size_and_the_informed_one_plays_under_its_shield(tmp_path):
+def test_models_sample_on_teams_of_their_own_size_and_the_informed_one_keeps_its_shield(tmp_path):
     whole = experiment(tmp_path)
 
     def names(N, model):
@@ -86,7 +86,7 @@ def test_rounds_have_equally_many_robot_states_for_every_size_of_the_team():
             assert getattr(config, name) * N == pytest.approx(getattr(full, name) * 12, rel=0.02)
 
 
-def test_only_what_is_missing_is_trained_and_a_training_that_was_stopped_goes_on(tmp_path, monkeypatch):
+def test_only_missing_models_are_trained_and_a_stopped_training_resumes(tmp_path, monkeypatch):
     shorter = replace(CONFIG, rounds=2)
     monkeypatch.setitem(RECIPES, "full", shorter)
     whole = experiment(tmp_path, taps=(3,))
@@ -140,7 +140,7 @@ def test_policies_of_the_package_are_tested_in_place_of_trained_ones(tmp_path):
     assert not whole.untrained()
 
 
-def test_what_no_model_has_is_refused(tmp_path):
+def test_unknown_models_are_refused(tmp_path):
     for wrong in ({"taps": (0,)}, {"taps": ()}, {"train_on": ()}):
         with pytest.raises(ValueError, match="at least one"):
             experiment(tmp_path, **wrong)
@@ -188,7 +188,7 @@ def test_a_model_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch
     assert [model.num_agents for model in whole.models if whole.is_trained(model)] == [12]
 
 
-def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
+def test_tables_and_figures_show_results_next_to_the_paper(tmp_path):
     whole = experiment(tmp_path)
     for N in (4, 6, 8, 10, 12):
         finish(whole, Model(N, 3), success=0.75)
@@ -211,7 +211,7 @@ def test_tables_and_figures_show_what_was_tested_beside_the_paper(tmp_path):
         assert picture.read_bytes()[:4] == b"\x89PNG"
 
 
-def test_the_tables_of_the_docs_are_drawn_from_the_results_beside_them():
+def test_the_tables_of_the_docs_match_the_results_next_to_them():
     folder = Path(__file__).parents[2] / "docs" / "paper"
     drawn = "\n".join(tables(Experiment(Options(folder=folder)))) + "\n"
     assert (folder / "results.md").read_text() == drawn

@@ -102,7 +102,7 @@ def run(folder: Path, out: Path, **options: Any) -> str:
     return console.export_text()
 
 
-def test_a_set_is_what_its_configuration_says(folder: Path) -> None:
+def test_a_set_follows_its_configuration(folder: Path) -> None:
     group = only_set(folder)
     assert (group.name, group.max_steps, group.sizes, group.seeds) == ("01-tiny", 20, (2, 3), (0, 5))
     assert group.map_names == ("hall", "corridor")
@@ -186,7 +186,7 @@ def test_published_lifelong_results_come_with_the_benchmark() -> None:
     ]
 
 
-def test_a_cell_is_played_once_and_the_tables_show_it_next_to_what_is_published(folder: Path, tmp_path: Path) -> None:
+def test_a_cell_is_played_once_and_the_tables_show_it_next_to_published_results(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shown = run(folder, out)
     files = {path: path.read_text() for path in out.glob("*/*/*/*.json")}
@@ -235,7 +235,7 @@ def test_fewer_cases_are_spread_over_all(folder: Path, tmp_path: Path) -> None:
     assert len(cell.cases) == 4
 
 
-def test_a_policy_is_known_by_its_weights_and_played_as_by_rollout(folder: Path, tmp_path: Path) -> None:
+def test_a_policy_is_identified_by_its_weights_and_played_as_by_rollout(folder: Path, tmp_path: Path) -> None:
     weights = tmp_path / "own, mine.safetensors"
     save(load("n4"), weights)
     by_file, by_name = (pogema_methods.method_named(each) for each in (str(weights), "n4,stuck"))
@@ -250,7 +250,7 @@ def test_a_policy_is_known_by_its_weights_and_played_as_by_rollout(folder: Path,
     assert played.flowtime.tolist() == expected.flowtime.tolist()
 
 
-def test_pibt_solves_what_it_solves_as_a_planner_and_counts_who_is_home_where_it_fails() -> None:
+def test_pibt_agrees_with_the_planner_and_counts_robots_on_goals_if_it_fails() -> None:
     grid = parse_map("......\n.#..#.\n......")
     easy = Instance(grid, [(0, 0), (2, 5)], [(2, 5), (0, 0)])
     swap = Instance(parse_map("....."), [(0, 0), (0, 1), (0, 4)], [(0, 1), (0, 0), (0, 4)])
@@ -306,7 +306,7 @@ def test_a_robot_alone_goes_from_goal_to_goal_without_a_detour() -> None:
             assert method.serve(instance, goals, 60, 0) == (times <= 60).sum()
 
 
-def test_what_is_played_does_not_depend_on_the_other_cases(folder: Path) -> None:
+def test_rollouts_do_not_depend_on_the_other_cases(folder: Path) -> None:
     instances = [case.instance for case in only_set(folder).cases(3)]
     for name in ("pibt", "greedy", "n4,sampled"):
         play = pogema_methods.method_named(name).play

@@ -69,7 +69,7 @@ def test_the_page_has_curves_tables_replays_and_speed(run: Path, tmp_path: Path)
     assert not re.findall(r'(?:src|href)="(?!#|data:)', page), "the page fetches something"
 
 
-def test_a_model_of_the_papers_experiment_shows_what_it_was_tested_on(run: Path, tmp_path: Path) -> None:
+def test_a_model_of_the_papers_experiment_shows_its_test_maps(run: Path, tmp_path: Path) -> None:
     tables = json.loads((run / "evaluation" / "results.json").read_text())["tables"]
     for N, success in ((6, 0.625), (14, 0.375)):
         table = tables["10"]

@@ -212,7 +212,7 @@ def test_outputs_go_through_links_and_into_devices(scen: Path) -> None:
     assert done.stdout.endswith(real.read_text())
 
 
-def test_a_reader_that_goes_away_is_no_traceback(scen: Path) -> None:
+def test_a_closed_pipe_gives_no_traceback(scen: Path) -> None:
     line = f"{sys.executable} -m experts solve {scen} --paths /dev/stdout | true"
     done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=True)
     assert "Traceback" not in done.stderr

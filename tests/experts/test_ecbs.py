@@ -172,7 +172,7 @@ def test_a_hard_case_asks_the_complete_search() -> None:
 
 @small
 @given(strategies.instances(max_side=5, min_agents=2, max_agents=10), st.sampled_from([1.05, 1.5, 3.0, 20.0]))
-def test_what_lacam_solves_within_the_bound_never_ends_at_the_node_limit(instance: Instance, w: float) -> None:
+def test_instances_that_lacam_solves_within_the_bound_never_end_at_the_node_limit(instance: Instance, w: float) -> None:
     result, lacam = experts.solve(instance, w=w, node_limit=200), experts.lacam(instance, node_limit=200)
     if not result.solved and lacam.cost is not None:
         assert lacam.cost > w * result.lower_bound
@@ -308,7 +308,7 @@ def test_bad_arguments_are_named(argument: str, value: object, error: type[Excep
         experts.solve_many([CORRIDOR], **{argument: value})  # pyright: ignore[reportArgumentType]
 
 
-def test_other_things_are_no_instances() -> None:
+def test_other_types_are_not_instances() -> None:
     with pytest.raises(TypeError, match=r"instances\[1\] must be a mapf_env.Instance, got int"):
         experts.solve_many([CORRIDOR, 7])  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"instance must be a mapf_env.Instance, got str"):

@@ -111,7 +111,7 @@ def test_a_solver_of_your_own() -> None:
             experts.solve_many([home], solver=lambda _: None, threads=threads)  # pyright: ignore[reportArgumentType]
 
 
-def test_unsolved_cases_are_reported_and_progress_is_told() -> None:
+def test_unsolved_cases_and_progress_are_reported() -> None:
     told: list[tuple[int, int]] = []
     mixed = [INSTANCES[0], IMPOSSIBLE, INSTANCES[1]]
     results = experts.solve_many(mixed, threads=2, progress=lambda done, solved: told.append((done, solved)))
@@ -119,7 +119,7 @@ def test_unsolved_cases_are_reported_and_progress_is_told() -> None:
     assert told == [(1, 1), (2, 1), (3, 2)]
 
 
-def test_progress_is_told_while_there_is_some(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_reported_during_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     solved: list[int] = []
     solve_batch = many.solve_batch
     monkeypatch.setattr(

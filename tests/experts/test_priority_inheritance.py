@@ -70,7 +70,7 @@ def test_robots_change_places_in_a_corridor_with_one_branch() -> None:
         assert experts.pibt(facing, swap=True, seed=seed).solved
 
 
-def test_swaps_bring_crowds_home_that_are_stuck_without() -> None:
+def test_swaps_solve_crowds_that_are_stuck_without_them() -> None:
     crowds = [random_instance(height=21, width=21, num_agents=16, style=Maze(), seed=seed) for seed in range(20)]
     plain, swap = (sum(experts.pibt(crowd, swap=swap).solved for crowd in crowds) for swap in (False, True))
     assert plain <= 5

@@ -54,7 +54,7 @@ def test_states_of_different_team_sizes_and_maps_in_one_call() -> None:
     assert actions.tolist() == [move for each in batch for move in first_actions(each)[0]]
 
 
-def test_the_expert_drives_every_team_home() -> None:
+def test_the_expert_brings_every_team_to_its_goals() -> None:
     instance = random_instance(num_agents=10, seed=1)
     solution = experts.solve(instance).solution
     assert solution is not None

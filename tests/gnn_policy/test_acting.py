@@ -222,7 +222,7 @@ def test_draws_follow_the_tempered_softmax_and_repeat_with_the_seed():
 
 @pytest.mark.parametrize("taps", [1, 3])
 @pytest.mark.parametrize("knows", [False, True])
-def test_robots_draw_when_they_are_stuck_or_hear_one_that_is(taps, knows):
+def test_robots_sample_when_they_or_a_neighbour_are_stuck(taps, knows):
     """A policy may read itself whether a robot is stuck; otherwise the environment adds that at the end."""
     own = ("stuck", "on_goal") if knows else ("on_goal",)
     execution = Execution(actions="stuck", temperature=1e6)
@@ -263,7 +263,7 @@ def test_robots_that_are_stuck_fall_back_on_their_shortest_way_and_those_that_he
         assert (np.diff(tiers[scores[robot].argsort()]) >= 0).all()
 
 
-def test_stuck_robots_of_a_dictionary_draw():
+def test_stuck_robots_of_a_dictionary_sample():
     policy = seeded_policy(execution=Execution(actions="stuck", temperature=1e6), comm_radius=0.0)
     instance = Instance(np.zeros((1, 4), bool), [[0, 0], [0, 3]], [[0, 3], [0, 1]])
     env = parallel_env(num_agents=2, height=1, width=4, density=0.0, **policy.env_settings())
@@ -284,7 +284,7 @@ def test_the_policy_is_left_in_the_mode_that_it_was_in(training):
     assert all(module.training == training for module in policy.modules())
 
 
-def test_what_cannot_be_acted_on_is_refused_with_the_way_out():
+def test_wrong_observations_are_refused_with_the_remedy():
     policy = seeded_policy(execution=Execution(actions="stuck"))
     settings = {"num_agents": 3, "height": 6, "width": 6, "fov_radius": 2}
     seen, _ = parallel_env(**settings).reset(seed=0)

@@ -72,7 +72,7 @@ def test_under_pibt_a_greedy_robot_would_rather_stay_than_lose_ground():
             assert np.argsort(-own[i])[len(nearer)] == oracles.IDLE
 
 
-def test_a_random_robot_takes_every_move_alike():
+def test_a_random_robot_takes_all_moves_equally_often():
     env = playing(RandomActor(), [random_cases()[0]] * 2000)
     moves = RandomActor().act(env)
     counts = np.stack([(moves == action).mean(axis=0) for action in range(5)])

@@ -195,7 +195,7 @@ DAMAGES = [
 
 
 @pytest.mark.parametrize("how", DAMAGES)
-def test_what_is_no_policy_of_ours_is_refused_in_one_line_that_names_the_file(file, how, capsys):
+def test_damaged_and_foreign_files_are_refused_in_one_line_that_names_the_file(file, how, capsys):
     damage(file, how)
     with pytest.raises(checkpoint.CheckpointError) as refusal:
         load(file)
@@ -334,7 +334,7 @@ def test_settings_of_a_wrong_type_or_range_are_refused_in_one_line_that_names_th
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "{" * 100_000, '{"a":' * 50_000, "[]", "nul", "1" * 5000])
-def test_settings_that_are_no_settings_are_refused(file, text, capsys):
+def test_unknown_settings_are_refused(file, text, capsys):
     with_metadata(file, policy=text)
     with pytest.raises(checkpoint.CheckpointError, match=r"policy\.safetensors"):
         load(file)
@@ -381,7 +381,7 @@ def test_the_same_weights_make_the_same_file(policy, tmp_path):
         assert (tmp_path / name).read_bytes() == (tmp_path / "one").read_bytes()
 
 
-def test_a_policy_is_rolled_out_as_its_file_says_unless_a_caller_says_otherwise(file):
+def test_a_policy_has_the_execution_of_its_file_unless_the_caller_gives_another(file):
     policy, cases = load(file), [random_instance(height=8, width=8, num_agents=6, seed=seed) for seed in range(3)]
 
     def paths(**how):

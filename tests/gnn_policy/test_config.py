@@ -107,7 +107,7 @@ def test_any_numbers_and_texts_return_from_toml(lr, density, radius, seed, share
     assert TrainConfig.from_toml(config.to_toml()) == config
 
 
-def test_a_file_that_a_person_writes_needs_only_what_differs_from_the_defaults(tmp_path):
+def test_a_settings_file_needs_only_what_differs_from_the_defaults(tmp_path):
     (tmp_path / "mine.toml").write_text(
         """
         rounds = 7
@@ -186,7 +186,7 @@ def test_an_unknown_setting_is_named_with_all_that_there_are(text, listed):
     assert TrainConfig.from_toml(text, ignore_unknown=True) in (TrainConfig(), TrainConfig(families=(Family(),)))
 
 
-def test_rollouts_of_training_play_as_the_policy_is_executed_except_for_their_draws():
+def test_rollouts_of_training_have_the_policys_execution_except_for_the_actions():
     config = TrainConfig(execution=Execution(actions="stuck", temperature=0.5, shield="pibt", comm_range="connected"))
     assert config.rollout_execution == replace(config.execution, actions="argmax")
     for actions in ("sampled", "stuck"):

@@ -157,7 +157,7 @@ def test_every_team_reaches_its_goals_under_the_expert(kind, cases, mixed, polic
 
 
 @pytest.mark.parametrize("kind", FAMILIES)
-def test_later_rounds_visit_what_the_policy_does_and_label_what_the_expert_would(kind, cases, mixed, policy):
+def test_later_rounds_follow_the_policy_and_label_with_the_expert(kind, cases, mixed, policy):
     played = {"alike": cases, "mixed": mixed}[kind]
     demonstrations, unsolved = collected(CONFIG, policy, played, 1, 1)
     assert unsolved == 0

@@ -103,7 +103,7 @@ def graph_of(batch, row, attr=False):
 
 @pytest.mark.parametrize("config", [PERCEIVED, replace(PERCEIVED, comm_weights="distance"), RICH])
 @pytest.mark.parametrize("sizes", SIZES)
-def test_without_augmentation_a_batch_is_what_play_shows(sizes, config):
+def test_without_augmentation_a_batch_equals_the_observation_in_play(sizes, config):
     grids, demonstrations = random_states(sizes)
     states = demonstrations.states
     batches = BatchMaker(grids, config, augment=False)

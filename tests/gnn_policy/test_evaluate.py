@@ -62,7 +62,7 @@ def test_the_help_names_every_option(capsys, monkeypatch):
     assert "Random seed for sampling and for the shield's tie-breaking" in text
 
 
-def test_what_is_not_given_is_as_in_training(file, monkeypatch):
+def test_settings_that_are_not_given_are_those_of_training(file, monkeypatch):
     config, folder, how = evaluated(monkeypatch, str(file))
     assert config == CONFIG
     assert how["num_agents"] == ()
@@ -71,7 +71,7 @@ def test_what_is_not_given_is_as_in_training(file, monkeypatch):
     assert folder == file.parent / "evaluation"
 
 
-def test_rows_play_under_the_shield_that_the_policys_file_says(monkeypatch, tmp_path):
+def test_executions_keep_the_shield_of_the_policys_file(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     _, folder, how = evaluated(monkeypatch, "n12-informed", "--executions", "argmax", "stuck,idle")
     assert how["executions"] == [Execution(shield="pibt"), Execution(actions="stuck")]
@@ -122,7 +122,7 @@ def test_it_writes_numbers_and_an_animation(file, capsys):
     assert str(folder) in shown.replace("\n", "")
 
 
-def test_the_rows_of_a_policy_are_its_own_execution_drawn_in_three_ways(file, monkeypatch):
+def test_the_default_executions_differ_in_their_actions(file, monkeypatch):
     execution = Execution(actions="sampled", temperature=0.5, shield="pibt", comm_weights="distance")
     save(DecentralizedPolicy(CONFIG.policy, execution), file, training=CONFIG.to_toml())
     _, _, how = evaluated(monkeypatch, str(file))
@@ -133,7 +133,7 @@ def test_the_rows_of_a_policy_are_its_own_execution_drawn_in_three_ways(file, mo
     assert how["executions"] == [Execution(actions="stuck", comm_weights="binary")]
 
 
-def test_families_of_training_have_a_table_each_unless_a_map_is_asked_for(file, monkeypatch, capsys):
+def test_families_of_training_have_a_table_each_unless_a_map_is_given(file, monkeypatch, capsys):
     save(DecentralizedPolicy(CONFIG.policy), file, training=replace(CONFIG, families=MIXED.families).to_toml())
     evaluate.main([str(file), "--threads", "1", "--executions", "argmax"])
     folder = file.parent / "evaluation"

@@ -88,7 +88,7 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
     }
 
 
-def test_the_rows_are_played_under_the_shield_that_the_policy_says(tmp_path):
+def test_the_executions_have_the_shield_of_the_policy(tmp_path):
     torch.manual_seed(0)
     execution = Execution(shield="pibt")
     policy = DecentralizedPolicy(PolicyConfig(encoder="lean", features=8, fov_radius=2), execution)

@@ -105,13 +105,13 @@ def test_environments_of_an_execution_show_which_robots_are_stuck(instance: Inst
 
 
 @pytest.mark.parametrize("own", [(), ("stuck",), ("greedy_moves", "on_goal"), ("stuck", "greedy_moves", "jammed")])
-def test_a_fallback_is_told_the_greedy_moves_and_who_is_stuck_or_jammed(own):
+def test_a_fallback_reads_the_greedy_moves_and_which_robots_are_stuck_or_jammed(own):
     known = Execution(actions="fallback").senses(PolicyConfig(robot_features=own)).robot_features
     assert known[: len(own)] == own
     assert sorted(known) == sorted({*own, "greedy_moves", "stuck", "jammed"})
 
 
-def test_a_fallback_prefers_shorter_ways_then_staying_then_the_draw():
+def test_a_fallback_prefers_shorter_paths_then_staying_then_the_noise():
     fallback, rng = Execution(actions="fallback", temperature=0.5), np.random.default_rng(0)
     logits = rng.normal(0, 100, (400, 5)).astype(np.float32)
     alarm, greedy, jammed = rng.random(400) < 0.5, rng.random((400, 5)) < 0.4, np.zeros(400, bool)
@@ -128,7 +128,7 @@ def test_a_fallback_prefers_shorter_ways_then_staying_then_the_draw():
         fallback.scores(logits, alarm, lambda drawn: noise[drawn])
 
 
-def test_a_jammed_robot_draws_among_all_moves_and_shorter_ways_are_likelier():
+def test_a_jammed_robot_samples_among_all_moves_and_prefers_shorter_paths():
     count = 20_000
     logits, greedy = (
         np.tile(np.log([0.3, 0.3, 0.2, 0.1, 0.1]).astype(np.float32), (count, 1)),
@@ -184,7 +184,7 @@ def test_draws_are_uniform_and_depend_on_each_argument():
     assert np.array_equal(uniform(seeds, moments, 20)[::3], uniform(seeds[::3], moments[::3], 20))
 
 
-def test_scores_of_a_robot_that_draws_are_its_tempered_logits_and_standard_gumbel_noise():
+def test_scores_of_a_robot_that_samples_are_tempered_logits_plus_gumbel_noise():
     logits = np.array([2.0, -1.0, 0.0, 0.5, 1.0], np.float32)
     seeds = np.arange(20_000, dtype=np.uint64)
     many = np.tile(logits, (len(seeds), 1))
@@ -206,7 +206,7 @@ def test_scores_of_a_robot_that_draws_are_its_tempered_logits_and_standard_gumbe
 
 
 @pytest.mark.parametrize("actions", ["argmax", "sampled", "stuck"])
-def test_every_robot_draws_or_no_robot_does_or_those_that_are_alarmed(actions):
+def test_all_robots_sample_or_none_or_the_alarmed_ones(actions):
     logits, alarm = np.zeros((6, 5), np.float32), np.arange(6) % 3 == 0
     asked = []
 

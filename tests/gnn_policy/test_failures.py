@@ -48,7 +48,7 @@ def test_a_blocker_that_leaves_its_goal_now_and_then_blocks_nothing():
     assert failure(instance, walked(instance, "I", "DU")) == "deadlock"
 
 
-def test_who_comes_nearer_at_the_end_is_only_late():
+def test_a_robot_that_comes_nearer_at_the_end_is_only_late():
     instance = parse_instance("A" + "." * 100 + "a")
     slow = np.zeros((2 * LAST_STEPS, 1, 2), int)
     slow[-1] = (0, 1)
@@ -136,7 +136,7 @@ def played_as(instances, solutions):
     )
 
 
-def test_the_worst_of_each_kind_come_first_beside_the_experts_solutions():
+def test_the_worst_of_each_kind_come_first_next_to_the_experts_solutions():
     plain = parse_instance("A.a\n...\nB.b")
     between = plain.starts + np.array([0, 1])
     straight = Solution(np.array([plain.starts, between, plain.goals]))

@@ -86,7 +86,7 @@ def test_running_statistics_are_those_of_the_first_half_and_steps_reach_both():
 
 
 @pytest.mark.parametrize("graph_layer", ["filter", "attention", "own_layers:Forgetful"])
-def test_the_number_of_threads_changes_no_bit(graph_layer):
+def test_results_are_bit_identical_on_any_number_of_threads(graph_layer):
     trained = []
     for threads in (1, 2, 2):
         policy = policy_with(graph_layer=graph_layer)
@@ -116,7 +116,7 @@ def test_small_batches_stay_whole(sizes):
     halves.close()
 
 
-def test_what_is_returned_needs_no_gradient():
+def test_returned_arrays_need_no_gradient():
     policy = policy_with()
     halves = HalfBatches(policy, ImitationLoss(policy), "float32", 2)
     figures = halves.backward(halves_of(policy, [3] * 2, [3] * 2))

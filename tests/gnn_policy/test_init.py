@@ -20,7 +20,7 @@ except ImportError as refusal:
 
 
 @pytest.mark.parametrize("library", ["torch", "torchrl"])
-def test_without_the_extra_the_message_says_what_to_install(library):
+def test_without_the_extra_the_message_names_what_to_install(library):
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT.format(library=library)], capture_output=True, text=True, check=True
     )
@@ -46,7 +46,7 @@ def test_openmp_waits_without_spinning_unless_the_user_says_how(given):
     assert (spin, policy) == (("1000", "None") if not given else tuple(str(given.get(n)) for n in NAMES))
 
 
-def test_every_public_name_is_defined_where_the_package_says():
+def test_every_public_name_is_defined_in_its_module():
     program = (
         "import sys, gnn_policy\n"
         "assert not {'torch', 'torchrl', 'matplotlib'} & sys.modules.keys()\n"

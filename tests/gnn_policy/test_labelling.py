@@ -74,7 +74,7 @@ SOLVERS = {
 
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("threads", [1, 3])
-def test_any_solver_can_teach_the_first_move_of_its_plan(cases, name, threads):
+def test_any_solver_can_label_states_with_the_first_move_of_its_plan(cases, name, threads):
     """States of different sizes in one call, each with the answer that it gets alone."""
     labeller = labeller_for(cases, solver=name, threads=threads)
     order = np.tile(np.arange(len(cases)), 2)
@@ -107,7 +107,7 @@ def test_goals_are_those_of_the_state(cases):
         assert of_team(moves, states, t).tolist() == first_moves(experts.solve(back, w=1.05), case.num_agents)
 
 
-def test_a_solver_that_finds_nothing_teaches_nothing():
+def test_states_that_a_solver_does_not_solve_are_left_out():
     corridor = Instance(np.zeros((1, 4), bool), [(0, 0), (0, 3)], [(0, 3), (0, 0)])
     cases = Cases([corridor], [corridor.grid], np.zeros(1, np.int32), np.zeros(1, np.int32))
     positions = [corridor.starts, corridor.goals, corridor.starts]
@@ -164,7 +164,7 @@ def label_in_order(case, order, **limits):
 
 
 @pytest.mark.parametrize(("robot_order", "sign"), [("index", 0), ("farthest", -1), ("nearest", 1)])
-def test_the_expert_meets_the_robots_in_the_order_asked_for(crowded, robot_order, sign):
+def test_the_expert_gets_the_robots_in_the_chosen_order(crowded, robot_order, sign):
     states = states_of(crowded, np.arange(len(crowded)))
     labeller = labeller_for(crowded, robot_order=robot_order, node_limit=500)
     moves, solved = labeller.moves(states)
@@ -221,7 +221,7 @@ def test_states_that_the_expert_cannot_solve_are_counted_and_left_out():
     assert (len(twice), counted) == (2 * len(found), 2 * unsolved)
 
 
-def test_plans_without_a_proof_teach_nothing():
+def test_plans_without_a_proof_give_no_labels():
     crowd = make_cases("train", seed=1, maps=1, cases_per_map=2, families=[Family(num_agents=(40, 40))])
     results = [experts.solve(case, w=1.02, node_limit=10) for case in crowd.instances]
     assert any(result.solution is not None and not result.solved for result in results), "the cases do not test this"

@@ -150,7 +150,7 @@ def test_attention_without_edge_features_needs_none():
     assert Attention(8, 8, 2)(features_of(generator, bag), bag).shape == (6, 8)
 
 
-def test_scores_beyond_the_range_of_the_exponential_do_no_harm():
+def test_scores_beyond_the_range_of_the_exponential_are_safe():
     generator = np.random.default_rng(2)
     bag = bags.random_bag(generator, [5, 1], EDGES, share=0.9)
     layer, features = made("attention", 2), features_of(generator, bag)

@@ -135,7 +135,7 @@ def test_lacam_plans_the_cases_where_ecbs_has_no_proof():
     assert np.array_equal(reference.solutions[0].paths, plan.paths)
 
 
-def test_which_cases_the_expert_solves_is_no_matter_of_time(monkeypatch):
+def test_the_solved_cases_do_not_depend_on_time(monkeypatch):
     asked = []
     solve = experts.solve_many
     monkeypatch.setattr(experts, "solve_many", lambda *cases, **how: (asked.append(how), solve(*cases, **how))[1])
@@ -187,7 +187,7 @@ def test_a_policy_that_sees_the_cost_to_go_is_marked_as_one_that_knows_the_map(c
     assert rows[0].name == "argmax*"
 
 
-def test_pibt_is_measured_like_everybody(compared):
+def test_pibt_is_measured_like_the_other_rows(compared):
     reference, _, rows, _, _ = compared
     increases, solved = [], 0
     for case, limit, base in zip(reference.instances, reference.max_steps, reference.flowtimes, strict=True):

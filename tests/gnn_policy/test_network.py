@@ -248,7 +248,7 @@ def test_a_bag_is_read_where_it_is_without_waiting_for_its_values(kind, encoder)
     assert logits.device.type == "meta"
 
 
-def test_a_policy_says_in_which_environment_it_acts():
+def test_a_policy_has_the_settings_of_its_environment():
     config = PolicyConfig(encoder="lean", fov_radius=3, comm_radius=2.5, robot_features=("on_goal",))
     policy = DecentralizedPolicy(config, Execution(actions="stuck", shield="pibt", comm_range="connected"))
     assert policy.env_settings() == {

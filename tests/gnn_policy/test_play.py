@@ -101,7 +101,7 @@ def test_every_option_reaches_the_rollout(home, monkeypatch):
     ]
 
 
-def test_a_policy_plays_as_its_file_says(home, monkeypatch):
+def test_a_policy_has_the_execution_of_its_file(home, monkeypatch):
     asked = []
     monkeypatch.setattr(
         sys.modules["gnn_policy.rollout"],
@@ -115,7 +115,7 @@ def test_a_policy_plays_as_its_file_says(home, monkeypatch):
     assert asked[-1] == Execution(shield="pibt"), "an execution keeps the shield of the file unless it names one"
 
 
-def test_a_lifelong_team_goes_on_to_the_last_step_and_its_arrivals_are_reported(home, capsys):
+def test_a_lifelong_team_plays_to_the_last_step_and_its_arrivals_are_reported(home, capsys):
     instance = load_scen("own.scen")
     save_scen("rest.scen", instance.at(instance.goals), "own.map")
     played("rest.scen", "--task", "lifelong", "--max-steps", "25")
@@ -134,7 +134,7 @@ def test_a_scenario_elsewhere_takes_the_first_robots_and_a_map(home):
     assert shown(home / "far.html")["scenes"][0]["goals"] == load_scen("own.scen", 2).goals.tolist()
 
 
-def test_a_team_that_is_home_has_solved_it(home, capsys):
+def test_a_team_that_starts_on_its_goals_has_solved_the_case(home, capsys):
     instance = load_scen("own.scen")
     save_scen("rest.scen", instance.at(instance.goals), "own.map")
     played("rest.scen")
@@ -220,7 +220,7 @@ def test_the_help_names_every_option(capsys, monkeypatch):
         assert (f"--{each.name.replace('_', '-')}" if each.name != "file" else "FILE") in text, each.name
 
 
-def test_a_page_that_nobody_named_replaces_no_file(home, capsys):
+def test_a_page_without_a_name_replaces_no_file(home, capsys):
     (home / "own.html").write_text("mine")
     (home / "own-2.html").symlink_to("nowhere")
     for name in ("own-3.html", "own-4.html"):

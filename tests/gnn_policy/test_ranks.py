@@ -107,7 +107,7 @@ def test_the_state_and_the_best_policy_are_those_of_the_team(whole):
 
 
 @pytest.mark.parametrize(("victim", "when"), [(0, 1), (1, 2)])
-def test_a_run_of_which_a_process_is_killed_goes_on_to_the_same_end(whole, tmp_path, victim, when):
+def test_a_run_with_a_killed_process_resumes_and_ends_the_same(whole, tmp_path, victim, when):
     killed = launch(tmp_path, "torn", victim=victim, when=when)
     assert killed.returncode != 0
     assert (tmp_path / "torn" / "state.pt").exists()
@@ -122,7 +122,7 @@ def test_a_run_of_which_a_process_is_killed_goes_on_to_the_same_end(whole, tmp_p
         assert_equal(one, two)
 
 
-def test_what_cannot_be_shared_evenly_is_refused():
+def test_uneven_shares_are_refused():
     assert Ranks(1, 2).share("batch_size", 8) == 4
     with pytest.raises(ValueError, match="batch_size must be a multiple of the 3 processes, got 8"):
         Ranks(0, 3).share("batch_size", 8)

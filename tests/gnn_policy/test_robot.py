@@ -253,7 +253,7 @@ def test_a_robot_that_is_reset_begins_another_case(own):
     assert [step(), step()] == [first, second]
 
 
-def test_a_robot_refuses_what_is_out_of_turn_or_does_not_fit():
+def test_a_robot_refuses_calls_out_of_turn_and_wrong_inputs():
     policy = seeded_policy(taps=2)
     robot, view = Robot(policy), np.zeros((3, 7, 7), np.float32)
     for out_of_turn in (robot.logits, robot.act, lambda: robot.message, lambda: robot.hear({})):

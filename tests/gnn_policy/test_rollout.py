@@ -184,7 +184,7 @@ def test_a_network_of_your_own_is_executed_like_a_policy(mixed, policy, executio
         assert all(same(played, plain, i, i) for i in range(len(mixed)))
 
 
-def test_what_is_neither_network_nor_actor_is_refused(cases):
+def test_only_networks_and_actors_are_played(cases):
     with pytest.raises(TypeError, match=r"Linear does not say .*: give it a `config`, .*PolicyConfig"):
         rollout(torch.nn.Linear(3, 5), cases)
     with pytest.raises(TypeError, match=r"plays a network or an actor, got str: an actor has `env_settings` and `act`"):
@@ -196,7 +196,7 @@ def test_what_is_neither_network_nor_actor_is_refused(cases):
 @pytest.mark.parametrize(
     "own", [Execution(actions="stuck"), Execution(shield="pibt", actions="sampled"), Execution(comm_range="connected")]
 )
-def test_a_policy_is_executed_in_its_own_way_unless_told_otherwise(cases, own):
+def test_a_policy_has_its_own_execution_by_default(cases, own):
     policy = seeded_policy(execution=own)
     by_itself, told = (rollout(policy, cases, max_steps=25, **more) for more in ({}, {"execution": own}))
     plain = rollout(policy, cases, max_steps=25, execution=Execution())
@@ -310,7 +310,7 @@ def test_equal_cases_end_equally_unless_their_seeds_differ(cases, policy):
     assert len({own.solutions[i].paths.tobytes() for i in range(6)}) == 3
 
 
-def test_goals_and_maps_are_part_of_what_draws_depend_on():
+def test_draws_depend_on_goals_and_maps():
     """The noise of cases that differ in anything is independent."""
     grid = np.zeros((4, 4), bool)
     walled = grid.copy()
@@ -564,7 +564,7 @@ def test_throughput_is_the_number_of_arrivals_a_step(mixed, shield):
     assert 0 < played.latched.sum() < len(mixed)
 
 
-def test_messages_that_are_all_lost_are_as_none_sent(cases, policy):
+def test_losing_all_messages_equals_sending_none(cases, policy):
     deaf = DecentralizedPolicy(replace(CONFIG, comm_radius=0.0))
     deaf.load_state_dict(policy.state_dict())
     whole, half, nothing, again = (
@@ -600,7 +600,7 @@ def test_no_instances_are_refused(policy):
         rollout(policy, [])
 
 
-def test_actions_that_are_no_numbers_are_refused(cases):
+def test_actions_that_are_not_numbers_are_refused(cases):
     class Broken(Blind):
         def act(self, env):
             return np.full((env.num_envs, env.num_agents, 5), np.nan, np.float32)

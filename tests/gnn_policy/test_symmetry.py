@@ -145,7 +145,7 @@ def test_moving_then_turning_equals_turning_then_moving(shape):
             assert moved_then_turned == (turned[0] + other[0], turned[1] + other[1])
 
 
-def test_each_state_has_a_symmetry_and_a_shape_of_its_own():
+def test_each_state_has_its_own_symmetry_and_shape():
     cells = np.tile(np.array([[[0, 1], [2, 3]]]), (16, 1, 1))
     shapes = np.repeat([[5, 5], [4, 6]], 8, axis=0)
     turned = symmetry.turn_cells(cells, np.arange(16)[:, None] % 8, shapes[:, None])

@@ -299,7 +299,7 @@ def test_starts_and_goals_are_drawn_on_a_given_map():
     assert len({each.tobytes() for each in starts}) > 15
 
 
-def test_what_it_cannot_play_is_refused():
+def test_cases_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="no cases"):
         TeamEnv(2, [])
     with pytest.raises(ValueError, match="observation must be one of dense, state"):

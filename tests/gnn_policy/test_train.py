@@ -24,7 +24,7 @@ def shown_help(capsys, command):
     return capsys.readouterr().out
 
 
-def test_the_help_names_every_setting_and_says_what_it_is(capsys, monkeypatch):
+def test_the_help_names_and_explains_every_setting(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     text = shown_help(capsys, train.main)
     options = [each.name for each in fields(TrainConfig) if each.name not in ("policy", "execution", "families")]

@@ -103,7 +103,7 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
         },
     ],
 )
-def test_a_run_stopped_after_any_round_goes_on_to_the_same_end(run, tmp_path, settings):
+def test_a_run_stopped_after_any_round_resumes_and_ends_the_same(run, tmp_path, settings):
     config = replace(CONFIG, **settings)
     if settings:
         run = trained(config, tmp_path / "whole")

@@ -115,7 +115,7 @@ def test_a_truth_value_is_not_an_action(play: Play, truth: Any) -> None:
 
 @INTERFACES
 @pytest.mark.parametrize("other", [1.0, np.float32(1), None, "1", b"1", 1j], ids=repr)
-def test_what_is_not_an_integer_is_not_an_action(play: Play, other: Any) -> None:
+def test_only_integers_are_actions(play: Play, other: Any) -> None:
     for first, second in ((other, 4), (4, other), (other, other)):
         with pytest.raises(TypeError):
             play(first, second)

@@ -139,7 +139,7 @@ def test_one_environment_meets_ever_new_instances() -> None:
     assert len(set(seen)) == 60
 
 
-def test_a_reset_without_a_seed_goes_on_with_the_stream() -> None:
+def test_a_reset_without_a_seed_continues_the_stream() -> None:
     one, other = BatchedEnv(2, num_agents=3), BatchedEnv(2, num_agents=3)
     for env in (one, other):
         env.reset(seed=8)
@@ -161,7 +161,7 @@ def test_the_instance_does_not_change_how_ties_are_drawn_nor_the_stream() -> Non
     assert_equal(env.reset(), other.reset())
 
 
-def test_ties_are_drawn_anew_in_each_step_and_episode() -> None:
+def test_ties_are_drawn_again_in_each_step_and_episode() -> None:
     """Two robots want the cell between them, after so many idle steps of so many an episode."""
     rivals = Instance(np.zeros((1, 4), bool), [[0, 0], [0, 2]], [[0, 1], [0, 3]])
     env = BatchedEnv(1, num_agents=2, height=1, width=4, density=0)
@@ -186,7 +186,7 @@ def out_of_band(env: Any) -> Any:
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), out_of_band])
-def test_copies_made_mid_episode_go_on_identically(duplicate: Any) -> None:
+def test_copies_made_mid_episode_continue_identically(duplicate: Any) -> None:
     for reset in (lambda env: env.reset(seed=5), lambda env: env.reset()):
         env = BatchedEnv(3, num_agents=8, height=6, width=6, max_cycles=20)
         reset(env)
@@ -245,7 +245,7 @@ def test_a_team_that_starts_on_its_goals_ends_with_the_first_step() -> None:
     assert env.step([[IDLE, IDLE]]).terminated.all()
 
 
-def test_arriving_in_the_last_step_is_no_truncation() -> None:
+def test_arriving_in_the_last_step_is_not_a_truncation() -> None:
     step = corridor(max_cycles=1).step([[RIGHT, IDLE]])
     assert step.terminated.tolist() == [True]
     assert step.truncated.tolist() == [False]
@@ -296,7 +296,7 @@ def test_an_episode_of_a_masked_seed_is_that_of_the_seed() -> None:
     assert (env.positions[1] == single.positions[0]).all()
 
 
-def test_what_was_returned_is_never_written_again() -> None:
+def test_returned_arrays_are_never_overwritten() -> None:
     env = BatchedEnv(2, num_agents=6)
     first = env.reset(seed=0)
     kept = copy.deepcopy(first)
@@ -345,7 +345,7 @@ def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: st
 
 
 @pytest.mark.parametrize("name", ["num_agents", "height", "width", "fov_radius", "max_cycles"])
-def test_settings_that_are_no_integers_are_refused(name: str) -> None:
+def test_settings_that_are_not_integers_are_refused(name: str) -> None:
     settings: dict[str, Any] = {name: 2.5}
     with pytest.raises(TypeError, match=f"{name} must be an integer, got 2.5"):
         EnvConfig(**settings)

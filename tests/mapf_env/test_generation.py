@@ -40,7 +40,7 @@ def test_walls_reach_usual_densities_exactly_and_lie_on_even_lines(
     assert not grid[1::2, 1::2].any()
 
 
-def test_walls_that_stand_badly_are_torn_down_and_built_anew() -> None:
+def test_walls_in_bad_places_are_removed_and_built_again() -> None:
     for seed in range(40):  # a quarter of these maps have no room at the first attempt
         assert random_map(density=0.4, style="walls", seed=seed).sum() == 160
 
@@ -124,7 +124,7 @@ def test_placement_is_uniform_over_the_free_cells() -> None:
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_where_robots_stand_says_nothing_about_the_map_of_the_same_seed(style: Style) -> None:
+def test_robots_starts_are_independent_of_the_map_of_the_same_seed(style: Style) -> None:
     """Robots start next to obstacles as often as by chance: map and placement have separate random streams."""
     seeds = np.arange(4000)
     grids = random_maps(seeds, style=style)
@@ -319,7 +319,7 @@ def test_a_maze_without_loops_is_a_tree_of_corridors(seed: int, corridor: int, r
     assert (open_maze == pillars).all(), "all walls are opened"
 
 
-def test_parts_have_the_sizes_that_were_asked_for() -> None:
+def test_parts_have_the_requested_sizes() -> None:
     rooms = random_map(height=11, width=15, style=Rooms(room_size=3), seed=0)
     inner = np.zeros((11, 15), bool)
     inner[3::4], inner[:, 3::4] = True, True

@@ -47,7 +47,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.parametrize("settings", [{}, {"task": "lifelong"}, {"observation": "box"}])
-def test_reused_buffers_show_what_fresh_ones_show(settings: dict[str, Any]) -> None:
+def test_reused_buffers_equal_new_ones(settings: dict[str, Any]) -> None:
     fresh, reused = parallel_env(**SMALL, **settings), parallel_env(**SMALL, **settings, reuse_buffers=True)
     generator, first = np.random.default_rng(0), None
     for episode in range(4):
@@ -176,7 +176,7 @@ def test_a_given_instance_may_have_a_map_of_any_size(height: int, width: int, se
     assert env.instance() == plain.instance()
 
 
-def test_copies_made_on_a_map_of_another_size_go_on_identically() -> None:
+def test_copies_made_on_a_map_of_another_size_continue_identically() -> None:
     env = parallel_env(num_agents=2, height=4, width=4)
     env.reset(seed=1, options={"instance": random_instance(num_agents=2, height=7, width=3, density=0.0, seed=0)})
     twin = pickle.loads(pickle.dumps(copy.deepcopy(env)))

@@ -89,7 +89,7 @@ def test_equal_seeds_give_equal_episodes_to_their_ends() -> None:
     assert_same(first, play(used, 3, episodes=12))
 
 
-def test_a_reset_without_a_seed_goes_on_with_the_stream() -> None:
+def test_a_reset_without_a_seed_continues_the_stream() -> None:
     one, other = parallel_env(**SMALL), parallel_env(**SMALL)
     for env in (one, other):
         env.reset(seed=1)
@@ -119,7 +119,7 @@ def test_it_is_the_batched_environment_with_a_batch_of_one() -> None:
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_copies_made_mid_episode_go_on_identically(duplicate: Any) -> None:
+def test_copies_made_mid_episode_continue_identically(duplicate: Any) -> None:
     env = parallel_env(**SMALL)
     env.reset(seed=2)
     for _ in range(5):
@@ -212,6 +212,6 @@ def test_bad_calls_are_refused() -> None:
 @pytest.mark.parametrize(
     "option", [{"autoreset": AutoresetMode.SAME_STEP}, {"fill": True}, {"num_envs": 1}, {"threads": 2}]
 )
-def test_what_only_a_batch_has_is_refused(make: Any, option: dict[str, Any]) -> None:
+def test_options_of_batches_are_refused(make: Any, option: dict[str, Any]) -> None:
     with pytest.raises(TypeError, match=next(iter(option))):
         make(**option)

@@ -63,7 +63,7 @@ def test_maps_and_scenarios_round_trip(tmp_path_factory, instance):
 
 
 @given(instances())
-def test_scenarios_hold_what_the_format_says(tmp_path_factory, instance):
+def test_scenarios_follow_the_format(tmp_path_factory, instance):
     folder = tmp_path_factory.mktemp("fields")
     save_map(folder / "a.map", instance.grid)
     save_scen(folder / "a.scen", instance, folder / "a.map")
@@ -272,7 +272,7 @@ def test_too_few_agents(files, count):
         load_scen(files(), num_agents=count)
 
 
-def test_a_missing_map_says_where_it_was_expected(files, tmp_path):
+def test_the_error_for_a_missing_map_names_the_expected_place(files, tmp_path):
     scen = files()
     (tmp_path / "a.map").unlink()
     with pytest.raises(
@@ -297,7 +297,7 @@ def test_a_scenario_is_only_written_for_its_own_map(tmp_path):
     assert not (tmp_path / "a.scen").exists()
 
 
-def test_a_map_that_is_none_is_not_written(tmp_path):
+def test_an_invalid_map_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="grid must have shape"):
         save_map(tmp_path / "a.map", np.zeros((0, 3), bool))
     with pytest.raises(TypeError, match="grid must be bool"):

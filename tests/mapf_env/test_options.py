@@ -129,7 +129,7 @@ def test_the_fused_step_is_the_rules_one_after_another(
 
 
 @given(strategies.crowds(max_side=6), st.data(), strategies.seeds)
-def test_pibt_never_collides_and_the_first_gets_what_it_wants(
+def test_pibt_never_collides_and_the_first_robot_gets_its_wanted_action(
     crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, seed: int
 ) -> None:
     grid, team = crowd
@@ -252,7 +252,7 @@ def test_two_robots_change_places_in_a_corridor_with_one_branch() -> None:
 
 @given(strategies.crowds(max_side=4, max_agents=3), st.data(), strategies.seeds)
 @hypothesis_settings(max_examples=50)
-def test_what_pibt_draws_by_lot_are_equal_priorities_and_the_last_of_the_preferences(
+def test_pibt_randomises_only_ties(
     crowd: tuple[oracles.Grid, list[oracles.Cell]], data: st.DataObject, seed: int
 ) -> None:
     grid, team = crowd
@@ -358,7 +358,7 @@ def test_the_smallest_radius_grows_too() -> None:
     assert 1 < rules.connecting_radius(np.array([[0, 0], [0, 1]], np.int32), 5e-324) < 1.1
 
 
-def test_messages_are_lost_as_often_as_asked_and_anew_in_each_step() -> None:
+def test_messages_are_lost_with_the_given_probability_in_each_step() -> None:
     graph = np.ones((1, 30, 30), np.float32)
     lost = [rules.lose_messages(graph, 0.3, np.zeros(1, np.uint64), np.array([time])) for time in range(20)]
     assert abs(1 - np.mean(lost) - 0.3) < 0.02  # five standard deviations of 18,000 draws
@@ -610,7 +610,7 @@ def test_robots_that_are_not_there_earn_and_do_nothing_wherever_one_stood_before
     assert replaced > 0
 
 
-def test_who_was_there_before_a_step_is_whom_its_outcome_is_of_also_where_it_begins_the_next_episode() -> None:
+def test_the_outcome_of_a_step_is_of_the_robots_present_before_it() -> None:
     cases = [random_instance(num_agents=n, height=5, width=5, seed=n) for n in (1, 3, 9)]
     settings: dict[str, Any] = {"num_agents": 9, "height": 5, "width": 5, "max_cycles": 3, "fill": True}
     wage = Rewards(on_goal=1.0, off_goal=1.0)

@@ -94,7 +94,7 @@ def test_splitting_and_joining_bags_changes_nothing(dtype: str) -> None:
 
 @given(strategies.all_settings(), strategies.seeds, st.integers(1, 3), st.integers(1, 2))
 @hypothesis_settings(max_examples=60)
-def test_an_environments_bag_is_what_its_states_perceive(
+def test_an_environments_bag_equals_the_observation_of_its_states(
     settings: dict[str, Any], seed: int, num_envs: int, threads: int
 ) -> None:
     env, generator = BatchedEnv(num_envs, threads=threads, **settings), np.random.default_rng(seed)

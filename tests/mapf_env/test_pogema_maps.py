@@ -161,7 +161,7 @@ def test_damaged_files_are_refused_with_their_line(tmp_path: Path, content: str,
         load_pogema_maps(file)
 
 
-def test_a_drawing_that_is_no_map_is_refused() -> None:
+def test_a_drawing_that_is_not_a_map_is_refused() -> None:
     for drawing, message in ((" \n", "line 1: the map has no cells"), ("..\n?.", r"line 2: unknown character '\?'")):
         with pytest.raises(ValueError, match=message):
             parse_pogema_map(drawing)

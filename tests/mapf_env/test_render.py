@@ -81,7 +81,7 @@ def shown_line(svg, anchor, seconds):
 
 
 @given(rollouts(), st.sampled_from([0.1, 0.4, 2.5]), st.integers(0, 4))
-def test_every_robot_is_where_its_path_says(rollout, step_seconds, pause_steps):
+def test_every_robot_follows_its_path(rollout, step_seconds, pause_steps):
     instance, solution = rollout
     svg = animate(instance, solution, step_seconds=step_seconds, pause_steps=pause_steps)
     robots = elements(svg, "g", "robot")

@@ -93,7 +93,7 @@ def browse(page: str, script: str, folder: Path) -> dict[str, object]:
 
 
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
-def test_the_page_plays_pauses_scrubs_and_tells_what_a_robot_knows(tmp_path: Path) -> None:
+def test_the_page_plays_pauses_scrubs_and_shows_what_a_robot_knows(tmp_path: Path) -> None:
     instance = Instance(np.zeros((4, 9), bool), [[0, 0], [0, 4], [3, 8]], [[0, 2], [0, 4], [3, 8]])
     paths = np.repeat(instance.starts[None], 41, axis=0)
     paths[20:, 0], paths[40:, 0] = (0, 1), (0, 2)

@@ -128,7 +128,7 @@ def test_the_winner_of_a_tie_changes_with_time() -> None:
 
 
 @given(strategies.crowds())
-def test_masks_forbid_exactly_what_leaves_the_map_or_hits_an_obstacle(crowd: Crowd) -> None:
+def test_masks_forbid_exactly_moves_off_the_map_and_into_obstacles(crowd: Crowd) -> None:
     grid, team = crowd
     free = oracles.free_cells(grid)
     maps = rules.bordered(grid[None], 2)
@@ -196,7 +196,7 @@ def test_robots_hear_each_other_strictly_within_the_radius(crowd: Crowd, radius:
     assert np.array_equal(rules.communication_graph(np.array([team, team], np.int32), radius)[1], graph)
 
 
-def test_the_graph_takes_lists_and_names_what_it_cannot_take() -> None:
+def test_the_graph_takes_lists_and_names_wrong_arguments() -> None:
     assert communication_graph([[0, 0], [0, 3]], 5.0).tolist() == [[0, 1], [1, 0]]
     with pytest.raises(ValueError, match="the communication radius must not be negative, got nan"):
         communication_graph([[0, 0]], float("nan"))

@@ -300,7 +300,7 @@ def test_the_one_with_priority_gets_the_cell_under_pibt(seed: int) -> None:
         assert goes == {i: bool(executed[i] != oracles.IDLE) for i in (0, 1)}
 
 
-def test_what_needs_the_map_says_so() -> None:
+def test_senses_that_need_the_map_are_marked() -> None:
     assert not Senses().needs_map
     local: Any = {"extra_channels": ("other_goals",), "robot_features": ("under_way",), "edge_features": ("on_goal",)}
     assert not Senses(**local).needs_map

@@ -48,7 +48,7 @@ def test_costs_count_until_the_last_arrival(walk: tuple[Instance, Solution]) -> 
 
 
 @given(walks())
-def test_an_answer_is_sound_exactly_if_no_step_has_a_fault(walk: tuple[Instance, Solution]) -> None:
+def test_a_solution_is_valid_exactly_if_no_step_has_a_fault(walk: tuple[Instance, Solution]) -> None:
     instance, solution = walk
     teams = [oracles.cells(team) for team in solution.paths]
     faulty = any(oracles.faults(instance.grid, before, after) for before, after in pairwise(teams))
