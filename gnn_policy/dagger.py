@@ -27,7 +27,7 @@ from gnn_policy.execution import episode_noise
 from gnn_policy.labelling import Labeller
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
-from gnn_policy.ranks import Ranks
+from gnn_policy.processes import Process
 from gnn_policy.team_env import ACTION, CASE, POSITIONS, STATE_KEYS, TeamEnv, states_of
 from mapf_env import Action, MapSet, States, perceive
 
@@ -108,13 +108,13 @@ def _collector(
     return Collector([make_env] * players, mixture, backend=backend, **settings, **own)
 
 
-def teams_side_by_side(config: TrainConfig, ranks: Ranks) -> int:
+def teams_side_by_side(config: TrainConfig, process: Process) -> int:
     """Return the number of teams that this process plays at a time.
 
     Raises:
         ValueError: If processes, or the collectors of a process, cannot share them evenly.
     """
-    teams = ranks.share("rollout_teams", config.rollout_teams)
+    teams = process.share("rollout_teams", config.rollout_teams)
     if teams % config.collectors:
         raise ValueError(
             f"rollout_teams of a process must be a multiple of its {config.collectors} collectors, got {teams}"
@@ -131,11 +131,11 @@ class Demonstrator:
         policy: DecentralizedPolicy,
         labeller: Labeller,
         cases: Cases,
-        ranks: Ranks = Ranks(),
+        process: Process = Process(),
     ) -> None:
         self._config, self._labeller, self._cases, self._map_of = config, labeller, cases, cases.map_of
-        self._rank, self._ranks = ranks.rank, ranks.count
-        teams, players = teams_side_by_side(config, ranks), config.collectors
+        self._rank, self._num_processes = process.rank, process.count
+        teams, players = teams_side_by_side(config, process), config.collectors
         self._mixture = Mixture(policy, labeller, config, cases)
         self._mixture.begin(beta=1.0, seed=0)
         make_env = functools.partial(
@@ -202,7 +202,7 @@ class Demonstrator:
 
     def _starts(self, steps: int, rng: np.random.Generator) -> States:
         """Return the starts of as many cases as have plans of about so many steps."""
-        config, count = self._config, max(steps // self._config.plan_steps // self._ranks, 1)
+        config, count = self._config, max(steps // self._config.plan_steps // self._num_processes, 1)
         chosen = rng.integers(len(self._cases), size=count)
         return States.start_of(
             [self._cases.instances[case] for case in chosen],

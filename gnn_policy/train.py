@@ -20,7 +20,7 @@ from gnn_policy.results_file import default_executions, read_tables, settings_of
 from gnn_policy.run_folder import RESULTS, check_run, is_finished
 
 if TYPE_CHECKING:
-    from gnn_policy.ranks import Ranks
+    from gnn_policy.processes import Process
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,10 @@ def _start(command: Command) -> None:
             _show_finished(folder, config)
             return
         check_run(folder, config)
-    from gnn_policy.ranks import join_ranks
+    from gnn_policy.processes import join_processes
 
-    with join_ranks() as ranks:
-        _train(config, folder, Console(quiet=ranks.rank > 0), ranks)
+    with join_processes() as process:
+        _train(config, folder, Console(quiet=process.rank > 0), process)
 
 
 def _show_finished(folder: Path, config: TrainConfig) -> None:
@@ -121,14 +121,14 @@ def _show_finished(folder: Path, config: TrainConfig) -> None:
     )
 
 
-def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) -> None:
+def _train(config: TrainConfig, folder: Path, console: Console, process: Process) -> None:
     from gnn_policy.command_line import on_device
     from gnn_policy.evaluation_report import evaluate_and_report
     from gnn_policy.progress import TrainingProgress
     from gnn_policy.training import Training
 
     progress = TrainingProgress(config.rounds, console)
-    training = Training(config, folder, progress, ranks)
+    training = Training(config, folder, progress, process)
     console.print(f"run folder: {folder}", highlight=False)
     if training.history:
         console.print(f"resuming after round {len(training.history)} of {config.rounds}", highlight=False)
@@ -139,7 +139,7 @@ def _train(config: TrainConfig, folder: Path, console: Console, ranks: Ranks) ->
         except KeyboardInterrupt:
             console.print(f"stopped; the same command resumes after round {len(training.history)}", highlight=False)
             raise SystemExit(130) from None
-        if ranks.rank > 0:
+        if process.rank > 0:
             return
         # The command line, which the run's settings agree with, has asked for its parts.
         policy = checkpoint.load(folder, plugins=tuple(config.policy.plugins.values()))

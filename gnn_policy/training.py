@@ -47,8 +47,8 @@ from gnn_policy.labelling import Labeller
 from gnn_policy.learning_curve import Round, draw_learning_curve
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
+from gnn_policy.processes import Process
 from gnn_policy.progress import TrainingProgress
-from gnn_policy.ranks import Ranks
 from gnn_policy.rollout import rollout
 from gnn_policy.run_folder import lock_run, open_run
 from mapf_env.files import replacing
@@ -64,7 +64,7 @@ class Training:
         config: The settings.
         folder: The run folder.
         progress: Shows each step of the work.
-        ranks: This process among those that train together.
+        process: This process, one of those that train together.
         clock: Measures seconds; `time.process_time` where the machine is shared.
 
     Raises:
@@ -77,20 +77,20 @@ class Training:
         config: TrainConfig,
         folder: Path,
         progress: TrainingProgress,
-        ranks: Ranks = Ranks(),
+        process: Process = Process(),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.config, self.folder, self.progress, self.ranks = config, folder, progress, ranks
-        ranks.share("batch_size", config.batch_size)
-        teams_side_by_side(config, ranks)
-        self.threads = cpu_threads(config.threads, ranks.local_count)
+        self.config, self.folder, self.progress, self.process = config, folder, progress, process
+        process.share("batch_size", config.batch_size)
+        teams_side_by_side(config, process)
+        self.threads = cpu_threads(config.threads, process.local_count)
         torch.set_num_threads(self.threads)
         torch.manual_seed(config.seed)
         self.policy = on_device(DecentralizedPolicy(config.policy, config.execution), config.device)
         if config.init is not None:
             _start_from(self.policy, config)
-        self.loss = ImitationLoss(ranks.average_gradients(self.policy))
-        alone = ranks.count == 1 and self.policy.head.weight.device.type == "cpu"
+        self.loss = ImitationLoss(process.wrap(self.policy))
+        alone = process.count == 1 and self.policy.head.weight.device.type == "cpu"
         self._halves = HalfBatches(self.policy, self.loss, config.precision, self.threads) if alone else None
         self._averaged = (
             AveragedModel(self.policy, multi_avg_fn=get_ema_multi_avg_fn(config.averaging), use_buffers=True)
@@ -125,7 +125,7 @@ class Training:
         self._shards: list[Demonstrations] = []
         found: dict[str, Any] | None = None
         self.lock: AbstractContextManager[Any] = nullcontext()
-        if ranks.rank == 0:
+        if process.rank == 0:
             self.lock = self._lock = lock_run(folder)
             try:
                 open_run(folder, config)
@@ -134,25 +134,25 @@ class Training:
                 raise
             (folder / "demonstrations").mkdir(exist_ok=True)
             found = self._read_state()
-        found = ranks.from_first(found)
+        found = process.from_first(found)
         if found is not None:
             self._restore(found)
-        if ranks.rank == 0:
+        if process.rank == 0:
             self._shards = self._kept_shards()
-        self._shards = ranks.from_first(self._shards)
+        self._shards = process.from_first(self._shards)
 
     def run(self) -> None:
         """Train all remaining rounds."""
-        config, first = self.config, self.ranks.rank == 0
+        config, first = self.config, self.process.rank == 0
         reference = self._reference_set() if first else None
         batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
-        demonstrator = Demonstrator(config, self._player, self._labeller, self._cases, self.ranks)
+        demonstrator = Demonstrator(config, self._player, self._labeller, self._cases, self.process)
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
             for number in range(len(self.history), config.rounds):
-                row = self._round(number, demonstrator, batches, reference)
+                row = self._run_round(number, demonstrator, batches, reference)
                 self.history.append(row)
                 if writer is not None:
                     for name, value in asdict(row).items():
@@ -180,7 +180,7 @@ class Training:
             self._validation, w=config.w, timeout=config.timeout, threads=self.threads, nodes=config.reference_nodes
         )
 
-    def _round(
+    def _run_round(
         self, number: int, demonstrator: Demonstrator, batches: BatchMaker, reference: metrics.ReferenceSet | None
     ) -> Round:
         config = self.config
@@ -188,10 +188,10 @@ class Training:
         if self._collects(number):
             self.progress.phase(number, "collecting")
             steps = config.dagger_steps if number else config.demonstration_steps
-            shares = self.ranks.gather(demonstrator.collect(number, steps))
+            shares = self.process.gather(demonstrator.collect(number, steps))
             collected = Demonstrations.concatenate([share for share, _ in shares])
             unlabelled = sum(count for _, count in shares)
-            if self.ranks.rank == 0:
+            if self.process.rank == 0:
                 collected.save(self._shard(number))
             self._shards.append(collected)
         demonstrations = Demonstrations.concatenate(self._shards)
@@ -247,7 +247,7 @@ class Training:
         """Mean loss and accuracy, and how many updates and robot states they were."""
         config = self.config
         rng = np.random.default_rng([config.seed, number])
-        draws_of_network = np.random.SeedSequence([config.seed, number, self.ranks.rank]).generate_state(1)
+        draws_of_network = np.random.SeedSequence([config.seed, number, self.process.rank]).generate_state(1)
         torch.manual_seed(int(draws_of_network[0]))  # as dropout makes them
         draws = self._draw(demonstrations, rng)
         updates = len(draws)
@@ -267,15 +267,15 @@ class Training:
                 if not np.isfinite(losses).all():
                     raise self._diverged(number, "the loss is not a finite number")
                 self.progress.fitted(number, update + 1, updates, losses, robots)
-        if self.ranks.count > 1:  # the last batch's statistics are each process's own
+        if self.process.count > 1:  # the last batch's statistics are each process's own
             for module in filter(None, (self.policy, self._averaged)):
-                module.load_state_dict(self.ranks.from_first(module.state_dict()))
+                module.load_state_dict(self.process.from_first(module.state_dict()))
         try:
             self._require_finite()
         except ValueError as damage:
             raise self._diverged(number, str(damage)) from damage
-        means = self.ranks.average(figures.mean(dim=0).cpu()).tolist()
-        return means[0], means[1], updates, sum(self.ranks.gather(robots))
+        means = self.process.average(figures.mean(dim=0).cpu()).tolist()
+        return means[0], means[1], updates, sum(self.process.gather(robots))
 
     def _backward(self, parts: list[TensorDict]) -> torch.Tensor:
         """Set the gradients; return the loss and accuracy (2,) of the batch."""
@@ -322,16 +322,16 @@ class Training:
             batches = rng.integers(first, size, (config.updates_per_round, config.batch_size))
             return [self._divide(batch, parts) for batch in batches]
         fill = Filler(np.diff(demonstrations.states.offsets), newest, config.fresh_share, rng)
-        pieces = parts * self.ranks.count
+        pieces = parts * self.process.count
         drawn = [[fill(config.batch_robots // pieces) for _ in range(pieces)] for _ in range(config.updates_per_round)]
-        return [batch[self.ranks.rank :: self.ranks.count] for batch in drawn]
+        return [batch[self.process.rank :: self.process.count] for batch in drawn]
 
     def _divide(self, batch: npt.NDArray[np.intp], parts: int) -> Parts:
         """Return this process's share of the states of a batch in parts, or as one if they are few.
 
         So batch norm always has several robots.
         """
-        own = batch[self.ranks.rank :: self.ranks.count]
+        own = batch[self.process.rank :: self.process.count]
         return np.array_split(own, parts if len(own) >= 4 else 1)
 
     def _validate(self, row: Round, reference: metrics.ReferenceSet) -> None:
@@ -363,7 +363,7 @@ class Training:
     def _save(self) -> None:
         """Write the records of the round, then the state that says it is done."""
         state = {
-            "processes": self.ranks.count,
+            "processes": self.process.count,
             "policy": self.policy.state_dict(),
             "averaged": None if self._averaged is None else self._averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -404,9 +404,9 @@ class Training:
                 raise ValueError("a figure of a round is not a finite number")
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, IndexError) as damage:
             raise self._damaged(damage) from damage
-        if processes != self.ranks.count:
+        if processes != self.process.count:
             raise ValueError(
-                f"{self.folder} holds a run of {processes} processes, not of {self.ranks.count}: go on with as many, "
+                f"{self.folder} holds a run of {processes} processes, not of {self.process.count}: go on with as many, "
                 "or choose another folder with --run"
             )
         self._seconds_before = self.history[-1].seconds

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gnn_policy.demonstrations import Demonstrations
-from gnn_policy.ranks import Ranks
+from gnn_policy.processes import Process
 from small_training import CONFIG
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="gloo and POSIX signals")
@@ -21,7 +21,7 @@ from rich.console import Console
 from gnn_policy import training
 from gnn_policy.config import TrainConfig
 from gnn_policy.progress import TrainingProgress
-from gnn_policy.ranks import join_ranks
+from gnn_policy.processes import join_processes
 
 folder, victim, when = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 config = TrainConfig.load(Path(sys.argv[4]))
@@ -32,19 +32,19 @@ class Progress(TrainingProgress):
         report = {name: t.clone() for name, t in run.policy.state_dict().items()}
         report["demonstrations"] = torch.tensor([len(s) for s in run._shards])
         report["loss"] = torch.tensor([row.loss, row.accuracy])
-        torch.save(report, folder.parent / f"{folder.name}-{ranks.rank}-{row.round}.pt")
+        torch.save(report, folder.parent / f"{folder.name}-{process.rank}-{row.round}.pt")
     def due(self):
         return True  # every update, however fast the machine
     def fitted(self, number, update, *rest):
-        if ranks.rank == victim and number == when and update == 2:
+        if process.rank == victim and number == when and update == 2:
             os.kill(os.getpid(), signal.SIGKILL)
 
-with join_ranks() as ranks:
-    run = training.Training(config, folder, Progress(config.rounds, Console(quiet=True)), ranks)
+with join_processes() as process:
+    run = training.Training(config, folder, Progress(config.rounds, Console(quiet=True)), process)
     run.run()
 tasks = Path("/proc/self/task")
 threads = sorted(each.joinpath("comm").read_text() for each in tasks.iterdir()) if tasks.exists() else []
-(folder.parent / f"{folder.name}-{ranks.rank}-threads").write_text("".join(threads))
+(folder.parent / f"{folder.name}-{process.rank}-threads").write_text("".join(threads))
 """
 
 
@@ -70,7 +70,7 @@ def assert_equal(one, two):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    home = tmp_path_factory.mktemp("ranks")
+    home = tmp_path_factory.mktemp("process")
     done = launch(home, "whole")
     assert done.returncode == 0, done.stderr
     return home
@@ -123,6 +123,6 @@ def test_a_run_with_a_killed_process_resumes_and_ends_the_same(whole, tmp_path, 
 
 
 def test_uneven_shares_are_refused():
-    assert Ranks(1, 2).share("batch_size", 8) == 4
+    assert Process(1, 2).share("batch_size", 8) == 4
     with pytest.raises(ValueError, match="batch_size must be a multiple of the 3 processes, got 8"):
-        Ranks(0, 3).share("batch_size", 8)
+        Process(0, 3).share("batch_size", 8)

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Ranks:
+class Process:
     """This process among those that train together."""
 
     rank: int = 0
@@ -61,22 +61,22 @@ class Ranks:
             tensor /= self.count
         return tensor
 
-    def average_gradients(self, module: nn.Module) -> nn.Module:
+    def wrap(self, module: nn.Module) -> nn.Module:
         """Wrap `module` to average gradients in its backward pass; batch norm follows the statistics of process 0."""
         return DistributedDataParallel(module) if self.count > 1 else module
 
 
 @contextmanager
-def join_ranks() -> Iterator[Ranks]:
+def join_processes() -> Iterator[Process]:
     """Join the other processes that `torchrun` started (nccl between GPUs, gloo otherwise); without it, run alone."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        yield Ranks()
+        yield Process()
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     distributed.init_process_group(backend, timeout=timedelta(hours=12))  # others wait while 0 validates
     try:
         local = int(os.environ["LOCAL_WORLD_SIZE"])
-        yield Ranks(distributed.get_rank(), distributed.get_world_size(), local)
+        yield Process(distributed.get_rank(), distributed.get_world_size(), local)
     finally:
         # A thread of the group that outlives it may ask for Python while the process ends, which aborts the process:
         # the group ends its threads only when nothing refers to it any more.
