@@ -12,6 +12,7 @@ from gnn_policy.baselines import GreedyActor
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.rollout import rollout
+from mapf_env.config import Shield
 
 
 def test_every_team_size_has_the_same_maps_which_look_like_those_of_pogema() -> None:
@@ -42,7 +43,8 @@ def test_the_table_agrees_with_rollouts(
     found = {(row[1], row[2]): row[3:6] for row in rows if row[0] == "random"}
     assert set(found) == {(size, way) for size in ("2", "8") for way in ("argmax", "PIBT", "PIBT with swap")}
     for size in (2, 8):
-        for way, shield in (("PIBT", "pibt"), ("PIBT with swap", "pibt_swap")):
+        shields: dict[str, Shield] = {"PIBT": "pibt", "PIBT with swap": "pibt_swap"}
+        for way, shield in shields.items():
             instances = generalist.instances_of("random", size, 3)
             played = rollout(GreedyActor(shield=shield), instances, seed=generalist.SEED, max_steps=20)
             success, on_goal, flowtime = found[str(size), way]

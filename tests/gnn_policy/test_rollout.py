@@ -16,7 +16,7 @@ import oracles
 from gnn_policy import DecentralizedPolicy, PolicyConfig, rollout
 from gnn_policy.baselines import GreedyActor, RandomActor
 from gnn_policy.cases import Family, make_cases
-from gnn_policy.execution import Execution
+from gnn_policy.execution import Actions, Execution
 from gnn_policy.rollout import PolicyActor
 from mapf_env import BatchedEnv, Instance, random_instance
 
@@ -31,7 +31,7 @@ RICH = replace(
     robot_features=("last_moves", "steps_left", "greedy_moves"),
     edge_features=("relative_position", "goal_direction"),
 )
-CHOICES = ["argmax", "sampled", "stuck"]
+CHOICES: list[Actions] = ["argmax", "sampled", "stuck"]
 
 
 def random_cases(seed=0, maps=6, num_agents=4, height=6, width=7, density=0.15, cases_per_map=2):
