@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
+from math import prod
 from typing import Any, Generic, Literal, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -18,7 +19,7 @@ from mapf_env.perception import Bag, States
 from mapf_env.team_state import TeamState
 
 _FLOAT = np.dtype(np.float32)
-_NO_WAY = np.iinfo(np.uint16).max
+_MOST_DENSE_BYTES = 2**33
 
 
 class Observation(NamedTuple):
@@ -221,7 +222,18 @@ class BatchedEnv:
         return bool(self._state.started.all())
 
     def buffers(self) -> Observation:
-        """Allocate arrays for observations, to be passed as `out`."""
+        """Allocate arrays for observations, to be passed as `out`.
+
+        Raises:
+            ValueError: If the communication graphs, which are dense here, would take more than 8 GiB.
+        """
+        graph_bytes = 4 * prod(self._graph_shape) * (1 + self.config.num_edge_features)
+        if graph_bytes > _MOST_DENSE_BYTES:
+            raise ValueError(
+                f"the dense communication graphs of {self.num_envs} teams of {self.num_agents} robots take "
+                f"{graph_bytes:,} bytes, more than {_MOST_DENSE_BYTES:,}: call reset and step with observe=False and "
+                "read bag(), whose size grows with the edges"
+            )
         return Observation(
             np.empty(self._fov_shape, self._dtype),
             np.empty(self._graph_shape, _FLOAT),
@@ -373,29 +385,27 @@ class BatchedEnv:
             raise ValueError(f"goals must have shape {state.goals.shape}, got {wanted.shape}")
         changed = self.present & (wanted != state.goals).any(axis=2)
         teams = np.flatnonzero(changed.any(axis=1))
-        tables = [self._distances_to(int(b), np.flatnonzero(changed[b]), wanted[b]) for b in teams]
-        for b, table in zip(teams, tables, strict=True):
+        ways = [self._ways_to(int(b), np.flatnonzero(changed[b]), wanted[b]) for b in teams]
+        for b, (tables, corners) in zip(teams, ways, strict=True):
             state.goals[b, changed[b]] = wanted[b, changed[b]]
             if state.distances.size:
-                state.distances[b, changed[b]] = table
+                state.distances[b, changed[b]], state.corners[b, changed[b]] = tables, corners
         state.on_goal[changed] = (state.positions == state.goals).all(axis=2)[changed]
 
-    def _distances_to(self, b: int, robots: npt.NDArray[np.intp], goals: npt.NDArray[np.int32]) -> npt.NDArray[Any]:
-        """Return distance tables (K, size) to the goals of K robots of team b, which must be free and reachable."""
-        state, border = self._state, self.config.fov_radius
+    def _ways_to(self, b: int, robots: npt.NDArray[np.intp], goals: npt.NDArray[np.int32]) -> tuple[Any, Any]:
+        """Return tables and corners of K robots of team b for their goals, which must be free and within reach."""
+        state = self._state
         height, width = state.grids.shape[1:]
         for robot in robots.tolist():
             row, col = goals[robot].tolist()
             if not (0 <= row < height and 0 <= col < width) or state.grids[b, row, col]:
                 raise ValueError(f"the goal ({row}, {col}) of agent {robot} in environment {b} is not a free cell")
-        table = rules.distance_tables(state.obstacles[b : b + 1], border, goals[None, robots])[0]
-        here = state.positions[b, robots] + border
-        lost = np.flatnonzero(table[np.arange(len(robots)), here[:, 0] * (width + 2 * border) + here[:, 1]] == _NO_WAY)
-        if len(lost):
-            robot = int(robots[lost[0]])
+        tables, corners, reached = self.stepper.ways_to(b, robots, np.ascontiguousarray(goals[robots]))
+        if not reached.all():
+            robot = int(robots[np.flatnonzero(~reached)[0]])
             row, col = goals[robot].tolist()
             raise ValueError(f"agent {robot} in environment {b} cannot reach the goal ({row}, {col}) from where it is")
-        return table
+        return tables, corners
 
     def advance(self, actions: npt.NDArray[Any], out: Observation | None) -> Observation | None:
         """Do `step` without copying the outcome, which stays in the state; return the final observation."""

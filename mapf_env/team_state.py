@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from math import isqrt
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,37 @@ import numpy.typing as npt
 
 from mapf_env.config import EnvConfig
 from mapf_env.senses import HISTORY
+
+MOST_TABLE_BYTES = 2**30
+"""Memory for the tables of steps to the goals of all robots of a `BatchedEnv`."""
+
+
+def table_shape(num_envs: int, config: EnvConfig) -> tuple[int, int]:
+    """Return the rows and columns of each robot's table of steps to its goal.
+
+    It covers the whole map inside its border if the tables of all robots then fit into `MOST_TABLE_BYTES`, and else as
+    much of it around the robot as fits; where the robot comes to its edge, the table is moved.
+
+    Raises:
+        ValueError: If not even what the robots see fits.
+    """
+    rows, cols = config.height + 2 * config.fov_radius, config.width + 2 * config.fov_radius
+    robots, least = num_envs * config.num_agents, 2 * config.fov_radius + 1
+    cells = MOST_TABLE_BYTES // (2 * robots)
+    if rows * cols <= cells:
+        return rows, cols
+    side = isqrt(cells)
+    if side < least:
+        raise ValueError(
+            f"{robots} robots that know the map need {2 * robots * least**2:,} bytes for the ways to their goals, more "
+            f"than {MOST_TABLE_BYTES:,}: take fewer environments at once, fewer robots or a smaller fov_radius, or "
+            "senses and a shield that need no map"
+        )
+    if rows <= cols:
+        rows = min(rows, side)
+        return rows, min(cols, cells // rows)
+    cols = min(cols, side)
+    return min(rows, cells // cols), cols
 
 
 @dataclass(eq=False, slots=True)
@@ -43,7 +75,9 @@ class TeamState:
     regions: npt.NDArray[np.int32]
     """(B, size) the connected region of each cell; empty unless goals change."""
     distances: npt.NDArray[np.uint16]
-    """(B, N, size) steps to the goal; empty unless they are needed."""
+    """(B, N, rows, cols) steps to the goal from the cells around each robot; empty unless they are needed."""
+    corners: npt.NDArray[np.int32]
+    """(B, N, 2) row and column of the bordered map at which each table begins."""
     times: npt.NDArray[np.int64]
     """(B,) steps since reset."""
     max_cycles: npt.NDArray[np.int32]
@@ -87,7 +121,8 @@ class TeamState:
             arrivals=np.zeros((B, N), np.int32),
             comm_radius=np.full(B, config.comm_radius, np.float64),
             regions=np.zeros((B, size if config.task == "lifelong" else 0), np.int32),
-            distances=np.zeros((B, N, size if config.needs_distances else 0), np.uint16),
+            distances=np.zeros((B, N, *(table_shape(B, config) if config.needs_distances else (0, 0))), np.uint16),
+            corners=np.zeros((B, N, 2), np.int32),
             times=np.zeros(B, np.int64),
             max_cycles=np.full(B, config.max_cycles, np.int32),
             started=np.zeros(B, np.bool_),

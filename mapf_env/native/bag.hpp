@@ -37,7 +37,7 @@ nanobind::tuple make_bag(const Senses& senses, double loss, std::size_t count, S
         for_each(count, [&](std::size_t t, int part) {
             const BagTeam<T> team = team_of(t, part, false);
             find_edges(team.facts.layout, team.facts.positions, team.facts.num_agents, team.facts.comm_radius,
-                       senses.weights, loss, key_of(t), team.standing, edges[t]);
+                       senses.weights, loss, key_of(t), team.standing, edges[t], team.facts.order);
         });
         for (std::size_t t = 0; t < count; ++t) {
             first_robot[t + 1] = first_robot[t] + size_of(t);
@@ -67,6 +67,7 @@ nanobind::tuple make_bag(const Senses& senses, double loss, std::size_t count, S
             write_edge_features(senses, team.facts, edge.receiver, edge.sender, attributes + e * D);
             ++e;
         }
+        std::vector<Edge>().swap(edges[t]);
     };
     {
         nanobind::gil_scoped_release release;

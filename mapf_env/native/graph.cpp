@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "mapf_env/native/random.hpp"
 #include "mapf_env/native/wide.hpp"
@@ -55,7 +56,8 @@ void communication_graph(const std::int32_t* positions, int num_agents, double r
 }
 
 void find_edges(const Layout& layout, const std::int32_t* positions, int num_agents, double radius, Weights weights,
-                double loss, std::uint64_t key, std::vector<int>& standing, std::vector<Edge>& edges) {
+                double loss, std::uint64_t key, std::vector<int>& standing, std::vector<Edge>& edges,
+                const int* order) {
     const float limit = least_too_far(radius);
     const auto add = [&](int i, int j) {
         const float down = static_cast<float>(positions[2 * i]) - static_cast<float>(positions[2 * j]);
@@ -74,7 +76,11 @@ void find_edges(const Layout& layout, const std::int32_t* positions, int num_age
     }
     standing.resize(std::max<std::size_t>(standing.size(), layout.size()), -1);
     for (int i = 0; i < num_agents; ++i) standing[layout.cell(positions[2 * i], positions[2 * i + 1])] = i;
-    for (int i = 0; i < num_agents; ++i) {
+    const std::size_t before = edges.size();
+    std::vector<std::size_t> begins(order ? num_agents : 0);
+    std::vector<int> counts(begins.size());
+    for (int k = 0; k < num_agents; ++k) {
+        const int i = order ? order[k] : k;
         const std::size_t first = edges.size();
         const int row = positions[2 * i], col = positions[2 * i + 1];
         const int left = std::max(col - reach, 0), right = std::min(col + reach, layout.width - 1);
@@ -83,6 +89,19 @@ void find_edges(const Layout& layout, const std::int32_t* positions, int num_age
                 if (const int j = standing[layout.cell(r, c)]; j >= 0) add(i, j);
         std::sort(edges.begin() + static_cast<std::ptrdiff_t>(first), edges.end(),
                   [](const Edge& one, const Edge& other) { return one.sender < other.sender; });
+        if (order == nullptr) continue;
+        begins[i] = first;
+        counts[i] = static_cast<int>(edges.size() - first);
+    }
+    if (order != nullptr) {  // bring them into the order of the receivers
+        std::vector<Edge> sorted;
+        sorted.reserve(edges.size());
+        sorted.insert(sorted.end(), edges.begin(), edges.begin() + static_cast<std::ptrdiff_t>(before));
+        for (int i = 0; i < num_agents; ++i) {
+            const auto first = edges.begin() + static_cast<std::ptrdiff_t>(begins[i]);
+            sorted.insert(sorted.end(), first, first + counts[i]);
+        }
+        edges = std::move(sorted);
     }
     for (int i = 0; i < num_agents; ++i) standing[layout.cell(positions[2 * i], positions[2 * i + 1])] = -1;
 }

@@ -48,8 +48,9 @@ inline void copy_window(const T* from, int stride, int any_radius, T* out) {
 // robots in view including oneself.
 //   obstacles  the map in its layout, as T, which is float or std::uint8_t; layout.border >= radius
 //   marks      layout.size() zeros; zeros again on return
+//   order      the robots in the order in which they are written, as of `order_by_tile`
 template <class T>
 void observe(const Layout& layout, const T* obstacles, const std::int32_t* positions, const std::int32_t* goals,
-             int num_agents, int radius, int num_planes, T* marks, T* out);
+             int num_agents, int radius, int num_planes, T* marks, T* out, const int* order = nullptr);
 
 }  // namespace mapf

@@ -158,8 +158,10 @@ void require_sound(const Maps<T>& maps, const TeamStates& states, const Senses& 
 template <class T>
 struct alignas(64) BagScratch {
     std::vector<T> marks;
-    std::vector<int> standing, queue;
-    std::vector<Distance> table, distance;
+    std::vector<int> standing, order, ends;
+    GoalSearch<T> search;
+    std::vector<Distance> tables;
+    std::vector<std::int32_t> corners;
     std::vector<std::uint8_t> greedy;
 };
 
@@ -191,17 +193,19 @@ nb::tuple perceive_states(const Maps<T>& maps, const TeamStates& states, const S
         team.limit = states.limits(t);
         team.comm_radius = states.comm_radius(t);
         if (needs_map) {
-            const Grid grid = grid_of(team.layout, maps.obstacles(map));
-            const std::size_t size = team.layout.size();
-            own.table.resize(team.num_agents * size);
-            for (int i = 0; i < team.num_agents; ++i) {
-                distances_to(grid, team.goal(i), own.distance, own.queue);
-                std::copy_n(own.distance.begin(), size, own.table.begin() + static_cast<std::ptrdiff_t>(i * size));
-            }
-            team.distances = own.table.data();
+            const int side = 2 * senses.fov_radius + 1;
+            const TableShape shape{side, side};
+            own.tables.resize(team.num_agents * shape.size());
+            own.corners.resize(2 * static_cast<std::size_t>(team.num_agents));
+            own.search.on(team.layout, maps.obstacles(map));
+            for (int i = 0; i < team.num_agents; ++i)
+                own.search.fill(team.goal(i), team.positions[2 * i], team.positions[2 * i + 1], shape,
+                                &own.corners[2 * i], &own.tables[i * shape.size()]);
+            team.ways = {own.tables.data(), own.corners.data(), shape};
             find_greedy_moves(team, own.greedy);
             team.greedy = own.greedy.data();
         }
+        team.order = order_by_tile(team.layout, team.positions, team.num_agents, own.order, own.ends);
         return {team, maps.obstacles(map), own.marks.data(), own.standing};
     };
     std::unique_ptr<Pool> pool;

@@ -99,25 +99,66 @@ private:
         return other == nobody || other == robot || next_[cell] != other;
     }
 
-    // Finds a move for the robot and the robots that it pushes. Returns false if there is none; then the robot stays.
+    struct Candidates {
+        std::array<std::uint8_t, num_actions> action{};
+        int count = 0;
+    };
+
+    // A robot that looks for a move, and how far it has come.
+    struct Plan {
+        int robot, pusher, partner = nobody, rank = 0;
+        Candidates candidates{};
+    };
+
+    template <class Swaps>
+    Plan plan_of(int robot, int pusher, const Swaps& swaps) const {
+        Plan plan{robot, pusher};
+        if constexpr (Swaps::on) {
+            // Swap: the robot that has to give way takes its candidates in reverse order, which leads it out backwards.
+            auto& [action, count] = plan.candidates = candidates_of(robot);
+            plan.partner = swap_partner(robot, cells_[robot] + steps_[action[0]], swaps);
+            if (plan.partner != nobody) std::reverse(action.begin(), action.begin() + count);
+        } else {
+            plan.candidates.count = num_actions;
+            std::copy_n(preferences_.data() + static_cast<std::size_t>(robot) * num_actions, num_actions,
+                        plan.candidates.action.begin());
+        }
+        return plan;
+    }
+
+    // Finds a move for the robot and those it pushes. If there is none it returns false, and the robot stays. Pushes can
+    // be as long as the team is large, so they are on a stack of their own.
     template <class Swaps>
     bool plan(int robot, int pusher, const Swaps& swaps) {
-        const int cell = cells_[robot];
-        const std::uint8_t* wanted = preferences_.data() + robot * num_actions;
-        int count = num_actions, partner = nobody;
-        // Swap: the robot that has to give way takes its candidates in reverse order, which leads it out backwards.
-        [[maybe_unused]] Candidates candidates;
-        if constexpr (Swaps::on) {
-            candidates = candidates_of(robot);
-            partner = swap_partner(robot, cell + steps_[candidates.action[0]], swaps);
-            if (partner != nobody) std::reverse(candidates.action.begin(), candidates.action.begin() + candidates.count);
-            wanted = candidates.action.data();
-            count = candidates.count;
+        plans_.clear();
+        plans_.push_back(plan_of(robot, pusher, swaps));
+        while (true) {
+            int pushed = nobody;
+            const bool moves = advance(plans_.back(), pushed);
+            if (pushed != nobody) {  // 3. Priority inheritance: a robot that stands there has to find a move of its own.
+                plans_.push_back(plan_of(pushed, plans_.back().robot, swaps));
+                continue;
+            }
+            if (!moves) step_back(plans_.back());
+            plans_.pop_back();
+            bool found = moves;
+            while (found && !plans_.empty()) {
+                pull(plans_.back());
+                plans_.pop_back();
+            }
+            if (plans_.empty()) return found;
+            ++plans_.back().rank;  // the robot in the way cannot make room
         }
-        for (int rank = 0; rank < count; ++rank) {
-            // 1. Skip cells that cannot be entered.
-            const std::uint8_t action = wanted[rank];
+    }
+
+    // Reserves the next cell that the robot can have, and returns true if it can move there now; `pushed` is the robot
+    // that has to leave that cell first, if there is one.
+    bool advance(Plan& plan, int& pushed) {
+        const int robot = plan.robot, cell = cells_[robot];
+        for (; plan.rank < plan.candidates.count; ++plan.rank) {
+            const std::uint8_t action = plan.candidates.action[plan.rank];
             const int target = cell + steps_[action];
+            // 1. Skip cells that cannot be entered.
             if (blocked_[target] != T{0} || next_[target] != nobody) continue;
             const int other = now_[target];
             const bool occupied = other != nobody && other != robot;
@@ -125,24 +166,23 @@ private:
             // 2. Reserve the cell.
             actions_[robot] = action;
             next_[target] = robot;
-            // 3. Priority inheritance: a robot that stands there has to find a move of its own.
-            if (occupied && actions_[other] == undecided && !plan(other, robot, swaps)) continue;
-            if (Swaps::on && rank == 0 && partner != nobody) pull(partner, cell);
+            if (occupied && actions_[other] == undecided) {
+                pushed = other;
+                return false;
+            }
+            pull(plan);
             return true;
-        }
-        // 4. Backtracking: the robot stays; a robot that has reserved its cell gives it up, unless that move was fixed.
-        const int claimant = next_[cell];
-        if (claimant == nobody || claimant == pusher) {
-            actions_[robot] = idle;
-            next_[cell] = robot;
         }
         return false;
     }
 
-    struct Candidates {
-        std::array<std::uint8_t, num_actions> action{};
-        int count = 0;
-    };
+    // 4. Backtracking: the robot stays; a robot that has reserved its cell gives it up, unless that move was fixed.
+    void step_back(const Plan& plan) {
+        const int cell = cells_[plan.robot], claimant = next_[cell];
+        if (claimant != nobody && claimant != plan.pusher) return;
+        actions_[plan.robot] = idle;
+        next_[cell] = plan.robot;
+    }
 
     // The actions that stay on the map, in the order of preference.
     Candidates candidates_of(int robot) const {
@@ -155,8 +195,9 @@ private:
     }
 
     // Pull: the partner takes the cell that the robot leaves, if neither of them is promised to anyone else.
-    void pull(int partner, int cell) {
-        if (actions_[partner] != undecided || next_[cell] != nobody) return;
+    void pull(const Plan& plan) {
+        const int partner = plan.partner, cell = cells_[plan.robot];
+        if (plan.rank != 0 || partner == nobody || actions_[partner] != undecided || next_[cell] != nobody) return;
         next_[cell] = partner;
         actions_[partner] = static_cast<std::uint8_t>(std::find(steps_.begin(), steps_.end(), cell - cells_[partner]) -
                                                       steps_.begin());
@@ -237,6 +278,7 @@ private:
     std::span<const int> cells_;
     std::span<const std::uint8_t> preferences_;
     std::span<std::uint8_t> actions_;
+    std::vector<Plan> plans_;
 };
 
 }  // namespace mapf

@@ -19,10 +19,11 @@ namespace {
 template <class T, class Hide>
 void copy_windows(const TeamFacts& team, int radius, int num_planes, const T* marks, T* out, Hide&& hide) {
     const int side = 2 * radius + 3;
-    for (int i = 0; i < team.num_agents; ++i, out += num_planes * side * side) {
-        const int row = team.positions[2 * i], col = team.positions[2 * i + 1];
+    for (int k = 0; k < team.num_agents; ++k) {
+        const int i = team.order ? team.order[k] : k, row = team.positions[2 * i], col = team.positions[2 * i + 1];
         hide(i, true);
-        copy_window<0>(marks + team.layout.cell(row - radius, col - radius), team.layout.stride(), radius, out);
+        copy_window<0>(marks + team.layout.cell(row - radius, col - radius), team.layout.stride(), radius,
+                       out + static_cast<std::size_t>(i) * num_planes * side * side);
         hide(i, false);
     }
 }
@@ -35,15 +36,14 @@ constexpr auto hide_nothing = [](int, bool) {};
 // unreachable cells have 2 * radius. Floats are divided by 2 * radius; bytes are offset by 2 * radius.
 template <class T>
 void write_cost_to_go(const TeamFacts& team, int radius, int num_planes, T*, T* out) {
-    const int side = 2 * radius + 3, plane = side * side, reach = 2 * radius, stride = team.layout.stride();
-    const Distance* distances = team.distances;
-    for (int i = 0; i < team.num_agents; ++i, out += num_planes * plane, distances += team.layout.size()) {
-        const int cell = team.cell(i);
-        const int here = distances[cell];
+    const int side = 2 * radius + 3, plane = side * side, reach = 2 * radius, stride = team.ways.shape.cols;
+    for (int i = 0; i < team.num_agents; ++i, out += num_planes * plane) {
+        const Distance* const way = team.way(i);
+        const int here = *way;
         std::fill_n(out, plane, static_cast<T>(std::is_same_v<T, float> ? 0 : reach));  // the ring is 0
         for (int down = -radius; down <= radius; ++down)
             for (int right = -radius; right <= radius; ++right) {
-                const int there = distances[cell + down * stride + right];
+                const int there = way[down * stride + right];
                 const int more = there == unreachable ? reach : std::clamp(there - here, -reach, reach);
                 T& value = out[(down + radius + 1) * side + right + radius + 1];
                 if constexpr (std::is_same_v<T, float>)
@@ -132,7 +132,7 @@ void write_steps_left(const TeamFacts& team, int, int, float* out) {
 float scaled_steps(double steps) { return static_cast<float>(std::min(1.0, std::log2(1.0 + steps) / 16.0)); }
 
 void write_steps_to_go(const TeamFacts& team, int, int robot, float* out) {
-    const Distance steps = team.distances[static_cast<std::size_t>(robot) * team.layout.size() + team.cell(robot)];
+    const Distance steps = *team.way(robot);
     *out = steps == unreachable ? 1.0f : scaled_steps(steps);
 }
 
@@ -294,27 +294,23 @@ Senses::Senses(int fov_radius, int memory, Weights weights, const std::vector<st
                 any_needs_map(this->edge_features);
 }
 
-std::uint8_t greedy_moves(const Layout& layout, const Distance* distances, int cell) {
-    const auto steps = layout.steps();
-    const Distance here = distances[cell];
-    unsigned moves = 0;
-    if (here != unreachable)
-        for (int action = 0; action < idle; ++action)
-            moves |= static_cast<unsigned>(distances[cell + steps[action]] < here) << action;
-    return static_cast<std::uint8_t>(moves ? moves : 1u << idle);
-}
-
 void find_greedy_moves(const TeamFacts& team, std::vector<std::uint8_t>& greedy) {
     greedy.resize(team.num_agents);
-    for (int i = 0; i < team.num_agents; ++i)
-        greedy[i] = greedy_moves(team.layout, team.distances + static_cast<std::size_t>(i) * team.layout.size(),
-                                 team.cell(i));
+    const int cols = team.ways.shape.cols;
+    for (int i = 0; i < team.num_agents; ++i) {
+        const Distance* const way = team.way(i);
+        unsigned moves = 0;
+        if (*way != unreachable)
+            for (int action = 0; action < idle; ++action)
+                moves |= static_cast<unsigned>(way[row_step[action] * cols + col_step[action]] < *way) << action;
+        greedy[i] = static_cast<std::uint8_t>(moves ? moves : 1u << idle);
+    }
 }
 
 template <class T>
 void write_views(const Senses& senses, const TeamFacts& team, const T* obstacles, T* marks, T* out) {
     observe(team.layout, obstacles, team.positions, team.goals, team.num_agents, senses.fov_radius, senses.num_planes,
-            marks, out);
+            marks, out, team.order);
     T* plane = out + num_channels * senses.side() * senses.side();
     for (const Channel* channel : senses.extra_channels) {
         if constexpr (std::is_same_v<T, float>)

@@ -7,9 +7,9 @@
 #include <string>
 #include <vector>
 
-#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/graph.hpp"
 #include "mapf_env/native/grid.hpp"
+#include "mapf_env/native/ways.hpp"
 
 namespace mapf {
 
@@ -24,14 +24,19 @@ struct TeamFacts {
     const std::int32_t* goals = nullptr;      // (N, 2)
     const std::int8_t* moves = nullptr;       // (N, history) executed moves, newest first; -1 before the start
     const std::int32_t* under_way = nullptr;  // (N) steps since the robot was on its goal
-    const Distance* distances = nullptr;      // (N, layout.size()) to the goals, where a sense needs the map
-    const std::uint8_t* greedy = nullptr;     // (N) of `greedy_moves`, where a sense needs the map
+    WayTables ways;                           // steps to the goals at least as far as robots see, where a sense needs the map
+    const std::uint8_t* greedy = nullptr;     // (N) of `find_greedy_moves`, where a sense needs the map
+    const int* order = nullptr;               // as of `order_by_tile`
     std::uint64_t seed = 0;
     std::int64_t time = 0, limit = 1;
     double comm_radius = 0.0;
 
     int cell(int robot) const { return layout.cell(positions[2 * robot], positions[2 * robot + 1]); }
     int goal(int robot) const { return layout.cell(goals[2 * robot], goals[2 * robot + 1]); }
+    // Steps to the goal from where the robot stands, as an entry of its table.
+    const Distance* way(int robot) const {
+        return ways.at(layout, robot, positions[2 * robot], positions[2 * robot + 1]);
+    }
     bool on_goal(int robot) const { return cell(robot) == goal(robot); }
 };
 
@@ -90,10 +95,7 @@ struct Senses {
     int view() const { return num_planes * side() * side(); }
 };
 
-// The moves that bring a robot on `cell` one step nearer to its goal, as bits; idle on the goal or without a way.
-std::uint8_t greedy_moves(const Layout& layout, const Distance* distances, int cell);
-
-// Writes `greedy_moves` of each robot of a team whose distances are known.
+// Writes the moves (N) that bring each robot one step nearer to its goal, as bits; idle on the goal or without a way.
 void find_greedy_moves(const TeamFacts& team, std::vector<std::uint8_t>& greedy);
 
 // Writes the views (N, num_planes, side, side) of a team on a map of `obstacles`; `marks` is layout.size() zeros.

@@ -117,8 +117,17 @@ public:
         teams_.on_goal = own<bool>("on_goal", {B, N});
         teams_.action_mask = own<std::int8_t>("action_mask", {B, N, num_actions});
         const bool distances = options_.swap || options_.senses.needs_map || options_.rewards.closer != 0.0f;
-        teams_.distances = own<Distance>("distances", {B, N, size}, !distances);
-        for (int part = 0; part < threads; ++part) scratch_.emplace_back(teams_.layout, static_cast<int>(N));
+        const auto tables = array<Distance, 4>("distances");
+        teams_.table = {static_cast<int>(tables.shape(2)), static_cast<int>(tables.shape(3))};
+        const int least = 2 * border + 1;
+        if (distances && (teams_.table.rows < least || teams_.table.cols < least || teams_.table.rows > rows ||
+                          teams_.table.cols > cols))
+            fail("distances must have shape (B, N, rows, cols), as far as robots see and no larger than the map");
+        teams_.distances = own<Distance>("distances", {B, N, tables.shape(2), tables.shape(3)}, !distances);
+        teams_.corners = own<std::int32_t>("corners", {B, N, 2});
+        require_corners();
+        const std::size_t parts = std::min<std::size_t>(threads, B);
+        for (std::size_t part = 0; part < parts; ++part) scratch_.emplace_back(teams_.layout, static_cast<int>(N));
     }
 
     // Steps and, unless `out` is None, writes what the teams perceive.
@@ -165,7 +174,7 @@ public:
         const std::size_t size = teams_.layout.size();
         const auto team_of = [&](std::size_t t, int part, bool needs_map) -> BagTeam<T> {
             auto& scratch = scratch_[part];
-            return {facts_of(teams_, teams[t], needs_map, scratch.greedy), teams_.obstacles + teams[t] * size,
+            return {facts_of(teams_, teams[t], needs_map, scratch), teams_.obstacles + teams[t] * size,
                     scratch.marks.data(), scratch.standing};
         };
         return make_bag<T>(
@@ -247,6 +256,35 @@ public:
         for (std::size_t k = 0; k < M; ++k) begin_team(teams_, options_, chosen(k), seeds(k), limits(k), episodes[k]);
     }
 
+    // The tables (K, rows, cols) and corners (K, 2) of K robots of team b with other goals, and whether they can reach
+    // them from where they stand. The arrays have no rows where the team has no tables.
+    nb::tuple ways_to(std::size_t b, In<std::int64_t, 1> robots, In<std::int32_t, 2> goals) {
+        const auto& layout = teams_.layout;
+        const std::size_t K = robots.shape(0);
+        require(b < teams_.num_envs && goals.shape(0) == K && goals.shape(1) == 2, "give a goal for each robot of a team");
+        for (std::size_t k = 0; k < K; ++k)
+            require(static_cast<std::uint64_t>(robots(k)) < teams_.num_agents && layout.contains(goals(k, 0), goals(k, 1)),
+                    "a robot or goal does not exist");
+        const bool keeps = teams_.distances != nullptr;
+        const TableShape shape = keeps ? teams_.table : TableShape{1, 1};
+        auto [tables, out_tables] = make_array<Distance>({K, shape.rows * 1u, shape.cols * 1u});
+        auto [corners, out_corners] = make_array<std::int32_t>({K, 2});
+        auto [reached, out_reached] = make_array<bool>({K});
+        {
+            nb::gil_scoped_release release;
+            auto& search = scratch_[0].search;
+            search.on(layout, teams_.obstacles + b * layout.size());
+            for (std::size_t k = 0; k < K; ++k) {
+                const std::int32_t* here = teams_.positions + 2 * (b * teams_.num_agents + robots(k));
+                Distance* const table = tables + k * shape.size();
+                search.fill(layout.cell(goals(k, 0), goals(k, 1)), here[0], here[1], shape, corners + 2 * k, table);
+                const WayTables ways{table, corners + 2 * k, shape};
+                reached[k] = *ways.at(layout, 0, here[0], here[1]) != unreachable;
+            }
+        }
+        return nb::make_tuple(out_tables, out_corners, out_reached);
+    }
+
     void write_action_masks() {
         for (std::size_t b = 0; b < teams_.num_envs; ++b) write_action_mask(teams_, b);
     }
@@ -267,6 +305,16 @@ private:
             fits = held.shape(axis) == shape.begin()[axis];
         if (!fits) fail(std::string(name) + " must have shape " + shown(shape));
         return held.data();
+    }
+
+    // Tables that were changed from outside must still lie on the map.
+    void require_corners() const {
+        if (teams_.distances == nullptr) return;
+        const auto& layout = teams_.layout;
+        for (std::size_t i = 0; i < 2 * teams_.num_envs * teams_.num_agents; i += 2)
+            if (teams_.corners[i] < 0 || teams_.corners[i] > layout.rows() - teams_.table.rows ||
+                teams_.corners[i + 1] < 0 || teams_.corners[i + 1] > layout.stride() - teams_.table.cols)
+                fail("a table of distances lies outside the map");
     }
 
     // Reads the arrays of an observation.
@@ -409,6 +457,8 @@ void define(nb::module_& m, const char* name, const char* memory) {
              "if the actions cannot be read.")
         .def("begin", &Stepper<T>::begin, "chosen"_a, "seeds"_a, "limits"_a, "grids"_a, "starts"_a, "goals"_a, "sizes"_a,
              "Begin episodes of the chosen environments (M,) on instances (M, ...), all of them or none.")
+        .def("ways_to", &Stepper<T>::ways_to, "team"_a, "robots"_a, "goals"_a,
+             "Tables (K, rows, cols) and corners (K, 2) of K robots of a team for other goals (K, 2), and which reach them.")
         .def("write_action_masks", &Stepper<T>::write_action_masks, "Bring the state's action_mask (B, N, 5) up to date.");
 }
 

@@ -22,7 +22,6 @@
 #include <cstring>
 #include <vector>
 
-#include "mapf_env/native/distances.hpp"
 #include "mapf_env/native/goals.hpp"
 #include "mapf_env/native/graph.hpp"
 #include "mapf_env/native/grid.hpp"
@@ -31,6 +30,7 @@
 #include "mapf_env/native/random.hpp"
 #include "mapf_env/native/senses.hpp"
 #include "mapf_env/native/shield.hpp"
+#include "mapf_env/native/ways.hpp"
 
 namespace mapf {
 
@@ -63,7 +63,9 @@ struct Teams {
     std::int8_t* moves;             // (B, N, history) executed moves, newest first; -1 before the start
     std::int32_t* under_way;        // (B, N) steps since the robot was on its goal
     std::int32_t* arrivals;         // (B, N) how often it has arrived
-    Distance* distances;            // (B, N, layout.size()) to the goals, only where they are asked for
+    TableShape table;               // of each robot, at least as far as it sees
+    Distance* distances;            // (B, N, rows, cols) steps to the goals around the robots, only where they are asked for
+    std::int32_t* corners;          // (B, N, 2) where the tables lie, as of `place_table`
     std::int64_t* times;            // (B)
     std::int32_t* max_cycles;       // (B) steps after which the episode is truncated
     bool *started, *ended;          // (B)
@@ -84,48 +86,40 @@ struct alignas(64) TeamScratch {
     std::vector<std::int8_t> executed;
     std::vector<int> standing;
     std::vector<float> rows, cols;
-    std::vector<int> goal_cells;
-    std::vector<Distance> distance;
-    std::vector<int> queue;
+    std::vector<int> goal_cells, order, ends;
+    GoalSearch<T> search;
 
     TeamScratch(const Layout& layout, int num_agents)
         : shield(layout, num_agents), pibt(layout, num_agents), marks(layout.size(), T{0}), taken(layout.size(), 0),
           executed(num_agents), goal_cells(num_agents) {}
 };
 
-template <class T>
-Grid grid_of(const Layout& layout, const T* obstacles) {
-    std::vector<std::uint8_t> blocked(layout.size());
-    std::transform(obstacles, obstacles + layout.size(), blocked.begin(), [](T cell) { return cell != T{0}; });
-    return {layout, std::move(blocked)};
-}
-
 // The start of an episode: its instance and, if a sense needs them, its distance tables.
 struct EpisodeStart {
     const std::uint8_t* grid;             // (height, width)
     const std::int32_t *starts, *goals;   // (N, 2)
     int size;                             // robots that are there
-    std::vector<Distance> distances;      // (size, layout.size()), if they are asked for
+    std::vector<Distance> distances;      // (size, rows, cols), if they are asked for
+    std::vector<std::int32_t> corners;    // (size, 2)
 };
 
 // Throws std::invalid_argument if a way is too long to be counted.
 template <class T>
 EpisodeStart prepare_episode(const Teams<T>& teams, const std::uint8_t* grid, const std::int32_t* starts, const std::int32_t* goals,
                 int size) {
-    EpisodeStart result{grid, starts, goals, size, {}};
+    EpisodeStart result{grid, starts, goals, size, {}, {}};
     if (teams.distances == nullptr) return result;
     const auto& layout = teams.layout;
     std::vector<std::uint8_t> blocked(layout.size(), 1);
     for (int row = 0; row < layout.height; ++row)
         std::copy_n(grid + static_cast<std::size_t>(row) * layout.width, layout.width, &blocked[layout.cell(row, 0)]);
-    const Grid map(layout, std::move(blocked));
-    std::vector<Distance> distance;
-    std::vector<int> queue;
-    result.distances.reserve(static_cast<std::size_t>(size) * layout.size());
-    for (int i = 0; i < size; ++i) {
-        distances_to(map, layout.cell(goals[2 * i], goals[2 * i + 1]), distance, queue);
-        result.distances.insert(result.distances.end(), distance.begin(), distance.end());
-    }
+    GoalSearch<std::uint8_t> search;
+    search.on(layout, blocked.data());
+    result.distances.resize(size * teams.table.size());
+    result.corners.resize(2 * static_cast<std::size_t>(size));
+    for (int i = 0; i < size; ++i)
+        search.fill(layout.cell(goals[2 * i], goals[2 * i + 1]), starts[2 * i], starts[2 * i + 1], teams.table,
+                    &result.corners[2 * i], &result.distances[i * teams.table.size()]);
     return result;
 }
 
@@ -146,8 +140,10 @@ void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, st
         const auto regions = regions_of(grid_of(layout, obstacles));
         std::copy(regions.begin(), regions.end(), teams.regions + b * size);
     }
-    if (teams.distances != nullptr)
-        std::copy(episode.distances.begin(), episode.distances.end(), teams.distances + first * size);
+    if (teams.distances != nullptr) {
+        std::copy(episode.distances.begin(), episode.distances.end(), teams.distances + first * teams.table.size());
+        std::copy(episode.corners.begin(), episode.corners.end(), teams.corners + 2 * first);
+    }
     std::copy_n(episode.starts, 2 * N, teams.positions + 2 * first);
     std::copy_n(episode.goals, 2 * N, teams.goals + 2 * first);
     std::fill_n(teams.moves + first * history, N * history, std::int8_t{-1});
@@ -167,9 +163,36 @@ void begin_team(const Teams<T>& teams, const Options& options, std::size_t b, st
     teams.ended[b] = false;
 }
 
+// The tables of team b.
+template <class T>
+WayTables ways_of(const Teams<T>& teams, std::size_t b) {
+    const std::size_t first = b * teams.num_agents;
+    return {teams.distances + first * teams.table.size(), teams.corners + 2 * first, teams.table};
+}
+
+// Fills the table of a robot of team b around where it stands. The search is on the team's map.
+template <class T>
+void find_way(const Teams<T>& teams, std::size_t b, int i, GoalSearch<T>& search) {
+    const std::size_t robot = b * teams.num_agents + i;
+    const std::int32_t *position = teams.positions + 2 * robot, *goal = teams.goals + 2 * robot;
+    search.fill(teams.layout.cell(goal[0], goal[1]), position[0], position[1], teams.table, teams.corners + 2 * robot,
+                teams.distances + robot * teams.table.size());
+}
+
+// Fills the tables again that do not reach as far as their robots see.
+template <class T>
+void renew_ways(const Teams<T>& teams, int radius, std::size_t b, GoalSearch<T>& search) {
+    if (teams.distances == nullptr || teams.table.is_whole(teams.layout)) return;
+    const WayTables ways = ways_of(teams, b);
+    const std::int32_t* positions = teams.positions + 2 * b * teams.num_agents;
+    for (int i = 0; i < teams.team_sizes[b]; ++i)
+        if (!ways.covers(teams.layout, i, positions[2 * i], positions[2 * i + 1], radius))
+            find_way(teams, b, i, search);
+}
+
 // The facts of team b that senses read, with distances and greedy moves if a sense needs them.
 template <class T>
-TeamFacts facts_of(const Teams<T>& teams, std::size_t b, bool needs_map, std::vector<std::uint8_t>& greedy) {
+TeamFacts facts_of(const Teams<T>& teams, std::size_t b, bool needs_map, TeamScratch<T>& scratch) {
     const std::size_t first = b * teams.num_agents;
     TeamFacts team;
     team.layout = teams.layout;
@@ -183,10 +206,11 @@ TeamFacts facts_of(const Teams<T>& teams, std::size_t b, bool needs_map, std::ve
     team.limit = teams.max_cycles[b];
     team.comm_radius = teams.comm_radius[b];
     if (needs_map) {
-        team.distances = teams.distances + first * teams.layout.size();
-        find_greedy_moves(team, greedy);
-        team.greedy = greedy.data();
+        team.ways = ways_of(teams, b);
+        find_greedy_moves(team, scratch.greedy);
+        team.greedy = scratch.greedy.data();
     }
+    team.order = order_by_tile(team.layout, team.positions, team.num_agents, scratch.order, scratch.ends);
     return team;
 }
 
@@ -212,7 +236,7 @@ void perceive(const Teams<T>& teams, const Options& options, std::size_t b, Team
     const auto& senses = options.senses;
     const std::size_t N = teams.num_agents, view = senses.view();
     const std::size_t scalars = senses.robot_columns, attributes = senses.edge_columns;
-    const TeamFacts team = facts_of(teams, b, senses.needs_map, scratch.greedy);
+    const TeamFacts team = facts_of(teams, b, senses.needs_map, scratch);
     const std::size_t n = team.num_agents;
     write_views(senses, team, teams.obstacles + b * layout.size(), scratch.marks.data(), out.fov);
     const int stride = static_cast<int>(N);
@@ -272,10 +296,7 @@ void give_goals(const Teams<T>& teams, std::size_t b, TeamScratch<T>& scratch) {
                                       goals + 2 * i);
         if (!is_new) continue;
         on_goal[i] = false;
-        if (teams.distances == nullptr) continue;
-        distances_to(grid_of(layout, teams.obstacles + b * layout.size()), layout.cell(goals[2 * i], goals[2 * i + 1]),
-                     scratch.distance, scratch.queue);
-        std::copy(scratch.distance.begin(), scratch.distance.end(), teams.distances + (first + i) * layout.size());
+        if (teams.distances != nullptr) find_way(teams, b, i, scratch.search);
     }
     mark(layout, goals, n, std::uint8_t{0}, scratch.taken.data());
 }
@@ -326,8 +347,7 @@ void shield_by_pibt(const Teams<T>& teams, const Options& options, std::size_t b
         const std::int32_t* goals = teams.goals + 2 * first;
         auto& cells = scratch.goal_cells;
         for (int i = 0; i < n; ++i) cells[i] = layout.cell(goals[2 * i], goals[2 * i + 1]);
-        const TableSwaps swaps{std::span<const int>(cells.data(), n),
-                               [&](int robot) { return teams.distances + (first + robot) * layout.size(); }};
+        const WaySwaps<T> swaps{layout, cells.data(), ways_of(teams, b), scratch.search};
         pibt_shield(layout, obstacles, positions, under_way, n, priorities, scratch.pibt, executed, swaps);
     } else {
         pibt_shield(layout, obstacles, positions, under_way, n, priorities, scratch.pibt, executed);
@@ -392,13 +412,13 @@ void record_moves(const Teams<T>& teams, std::size_t b, const std::int8_t* execu
 // Step 4: adds the reward for every step by which the distance to the goal has become shorter.
 template <class T>
 void reward_progress(const Teams<T>& teams, float closer, std::size_t b, const std::int8_t* executed) {
-    const auto& layout = teams.layout;
-    const auto steps = layout.steps();
     const std::size_t first = b * teams.num_agents;
-    const Distance* distance = teams.distances + first * layout.size();
-    for (std::size_t i = 0; i < static_cast<std::size_t>(teams.team_sizes[b]); ++i, distance += layout.size()) {
-        const int cell = layout.cell(teams.positions[2 * (first + i)], teams.positions[2 * (first + i) + 1]);
-        teams.rewards[first + i] += closer * static_cast<float>(distance[cell - steps[executed[i]]] - distance[cell]);
+    const std::int32_t* positions = teams.positions + 2 * first;
+    const WayTables ways = ways_of(teams, b);
+    for (int i = 0; i < teams.team_sizes[b]; ++i) {
+        const Distance* const way = ways.at(teams.layout, i, positions[2 * i], positions[2 * i + 1]);
+        const int back = row_step[executed[i]] * ways.shape.cols + col_step[executed[i]];
+        teams.rewards[first + i] += closer * static_cast<float>(way[-back] - way[0]);
     }
 }
 
@@ -430,7 +450,7 @@ void end_or_continue(const Teams<T>& teams, const Options& options, std::size_t 
 
 // Executes one joint action of team b, which the caller has checked:
 //
-//     wanted --shield--> executed --move--> positions --> rewards, arrivals, history --> ended? --> new goals
+//     wanted --shield--> executed --move--> positions --> rewards, arrivals, history --> ended? --> new goals --> ways
 //
 // Invariant: no two robots of a team share a cell, before and after; the shield alone sees to that, and no later step
 // changes an action.
@@ -438,6 +458,7 @@ template <class T>
 void step_team(const Teams<T>& teams, const Options& options, std::size_t b, JointAction wanted,
                TeamScratch<T>& scratch) {
     const std::int8_t* executed = scratch.executed.data();
+    scratch.search.on(teams.layout, teams.obstacles + b * teams.layout.size());
     if (options.pibt)
         shield_by_pibt(teams, options, b, wanted, scratch);
     else
@@ -448,6 +469,7 @@ void step_team(const Teams<T>& teams, const Options& options, std::size_t b, Joi
     clear_absent(teams, b);
     end_or_continue(teams, options, b, all_on_goal);
     if (options.lifelong) give_goals(teams, b, scratch);
+    renew_ways(teams, options.senses.fov_radius, b, scratch.search);
 }
 
 }  // namespace mapf

@@ -55,6 +55,7 @@ void play(std::uint64_t seed) {
 
     Options options;
     options.pibt = random.below(2);
+    options.swap = random.below(2);
     options.lifelong = random.below(2);
     options.message_loss = random.below(3) / 2.0;
     const auto some = [&](auto rows) {
@@ -78,7 +79,13 @@ void play(std::uint64_t seed) {
     std::int32_t max_cycles = 0;
     std::vector<T> map(size, T{1});
     std::vector<std::int32_t> positions(2 * N), goals(2 * N), previous(2 * N), under_way(N), arrivals(N), regions(size, -1);
-    std::vector<Distance> distances(N * size);
+    teams.table = {teams.layout.rows(), teams.layout.stride()};
+    if (random.below(2)) {  // a part of the map, at least as large as what a robot sees
+        teams.table.rows = 2 * radius + 1 + random.below(teams.table.rows - 2 * radius);
+        teams.table.cols = 2 * radius + 1 + random.below(teams.table.cols - 2 * radius);
+    }
+    std::vector<Distance> distances(N * teams.table.size());
+    std::vector<std::int32_t> corners(2 * N);
     std::unique_ptr<bool[]> cells_blocked(new bool[area]());
     bool started = false, ended = true, terminated = false, truncated = false;
     std::vector<float> rewards(N), graph(N * N);
@@ -91,7 +98,7 @@ void play(std::uint64_t seed) {
     teams.obstacles = map.data(), teams.team_sizes = &team_size, teams.seeds = &episode, teams.comm_radius = &comm_radius;
     teams.regions = regions.data(), teams.positions = positions.data(), teams.goals = goals.data();
     teams.moves = moves.data(), teams.max_cycles = &max_cycles, teams.under_way = under_way.data(), teams.arrivals = arrivals.data();
-    teams.distances = distances.data(), teams.times = &time, teams.ended = &ended, teams.rewards = rewards.data();
+    teams.distances = distances.data(), teams.corners = corners.data(), teams.times = &time, teams.ended = &ended, teams.rewards = rewards.data();
     teams.terminated = &terminated, teams.truncated = &truncated, teams.replaced = replaced.get();
     teams.arrived = arrived.get(), teams.on_goal = on_goal.get(), teams.action_mask = mask.data();
 
