@@ -1,4 +1,4 @@
-"""A strided convolution as matrix products, in training several times faster on CPUs than the library's own."""
+"""A strided convolution that trains as matrix products, several times faster on CPUs than the library's own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class StridedConvolution(nn.Module):
     """A 3x3 convolution of stride 2 and padding 1, with the parameters and results of `nn.Conv2d(..., 3, 2, 1)`.
 
     Views are so small that all time of the library's backward pass goes into its set-up; a matrix product has none, and
-    uses a CPU's units for bfloat16.
+    uses a CPU's units for bfloat16. Without gradients the library's forward pass is twice as fast.
     """
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
@@ -28,7 +28,7 @@ class StridedConvolution(nn.Module):
 
     def forward(self, maps: Float[Tensor, "M C H W"]) -> Float[Tensor, "M D h w"]:
         """Return maps of half the height and width, rounded up; fastest in channels-last memory."""
-        if maps.device.type != "cpu":  # the products are for CPUs: elsewhere the library's own is faster
+        if maps.device.type != "cpu" or not torch.is_grad_enabled():
             return functional.conv2d(maps, self.weight, self.bias, stride=2, padding=1)
         kind = maps.device.type
         dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else maps.dtype

@@ -7,6 +7,8 @@ nothing else.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -67,6 +69,42 @@ def exchange(layer: MessageLayer, features: Float[Tensor, "M F"], bag: Bag) -> F
         heard = layer.send(state, number).index_select(0, sender)
         state = layer.combine(state, layer.receive(state, heard, links, number), number)
     return layer.finish(state)
+
+
+def exchange_in_parts(
+    layer: MessageLayer, features: Iterator[Float[Tensor, "m F"]], bag: Bag, size: int
+) -> Iterator[Float[Tensor, "m G"]]:
+    """Do what `exchange` does for `size` robots at a time, so that no more memory is needed for each link.
+
+    Args:
+        layer: The layer.
+        features: The features of the first `size` robots, of the next, and so on.
+        bag: The bag.
+        size: Robots at a time.
+
+    Yields:
+        The new features of the same robots.
+    """
+    if (bag.edge_index[1, 1:] < bag.edge_index[1, :-1]).any():
+        order = bag.edge_index[1].argsort(stable=True)
+        bag = bag._replace(
+            edge_index=bag.edge_index[:, order], edge_weight=bag.edge_weight[order], edge_attr=bag.edge_attr[order]
+        )
+    sender, receiver = bag.edge_index[0], bag.edge_index[1]
+    firsts = torch.arange(0, len(bag.team), size)
+    ends = torch.searchsorted(receiver, torch.cat([firsts, firsts[-1:] + size]).to(receiver.device)).tolist()
+    parts = [slice(begin, end) for begin, end in pairwise(ends)]
+    links = [
+        Links(receiver[part] - first, bag.edge_weight[part], bag.edge_attr[part])
+        for first, part in zip(firsts.tolist(), parts, strict=True)
+    ]
+    states = [layer.start(each, links[part]) for part, each in enumerate(features)]
+    for number in range(layer.rounds):
+        sent = torch.cat([layer.send(state, number) for state in states])
+        for part, state in enumerate(states):
+            heard = sent.index_select(0, sender[parts[part]])
+            states[part] = layer.combine(state, layer.receive(state, heard, links[part], number), number)
+    yield from map(layer.finish, states)
 
 
 def gather(values: Float[Tensor, "E ..."], receiver: Int[Tensor, " E"], count: int) -> Float[Tensor, "M ..."]:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from gnn_policy.acting import act
 from gnn_policy.convolution import StridedConvolution
 from gnn_policy.execution import Execution
-from gnn_policy.layers import GRAPH_LAYERS
+from gnn_policy.layers import GRAPH_LAYERS, MessageLayer, exchange_in_parts
 from gnn_policy.plugins import import_by_name
 from gnn_policy.policy_config import PolicyConfig
 from mapf_env import Action, Bag
@@ -54,6 +54,9 @@ def lean_encoder(channels: int, side: int, features: int) -> nn.Sequential:
         nn.ReLU(),
     )
 
+
+_AT_ONCE = 4096
+"""Robots whose views are read, and links gathered, at a time where no gradients are needed."""
 
 ENCODERS = {"released": released_encoder, "lean": lean_encoder}
 
@@ -105,7 +108,11 @@ class DecentralizedPolicy(nn.Module):
                 f"links have {bag.edge_attr.shape[-1]} features, this policy reads {D}: make the environment with "
                 f"edge_features={self.config.edge_features} and memory={self.config.memory}"
             )
-        return self.decide(self.graph_layer(self.extract(bag.fov, bag.scalars), bag))
+        layer = self.graph_layer
+        if self.training or torch.is_grad_enabled() or len(bag.team) <= _AT_ONCE or not isinstance(layer, MessageLayer):
+            return self.decide(layer(self.extract(bag.fov, bag.scalars), bag))
+        features = map(self.extract, bag.fov.split(_AT_ONCE), bag.scalars.split(_AT_ONCE))
+        return torch.cat([self.decide(each) for each in exchange_in_parts(layer, features, bag, _AT_ONCE)])
 
     def extract(self, fov: Shaped[Tensor, "M C S S"], scalars: Float[Tensor, "M K"]) -> Float[Tensor, "M F"]:
         """Return the features that robots make from their views (float or uint8) and scalars, and communicate.

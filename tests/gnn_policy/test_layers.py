@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import bags
 from gnn_policy import Attention, DecentralizedPolicy, GraphFilter, PolicyConfig
-from gnn_policy.layers import GRAPH_LAYERS, MessageLayer
+from gnn_policy.layers import GRAPH_LAYERS, MessageLayer, exchange_in_parts
 from mapf_env import Bag, Senses
 
 few = settings(max_examples=25)
@@ -179,6 +179,21 @@ def test_teams_together_are_each_team_alone(kind, seed, sizes, taps):
         together = layer(features, bag)
         alone = [layer(part, own) for part, own in zip(features.split(sizes), bags.split(bag), strict=True)]
     torch.testing.assert_close(torch.cat(alone), together, rtol=1e-5, atol=1e-5)
+
+
+@few
+@given(st.sampled_from(sorted(GRAPH_LAYERS)), st.integers(0, 10**6), sizes, st.integers(1, 4), st.integers(1, 9))
+def test_robots_in_parts_exchange_what_they_do_at_once(kind, seed, sizes, taps, at_once):
+    generator, layer = np.random.default_rng(seed), made(kind, taps)
+    bag = bags.random_bag(generator, sizes, EDGES, share=0.5, weighted=True, directed=True)
+    if seed % 2:
+        bag = bags.permuted(bag, np.arange(sum(sizes)), generator)  # links in any order
+    features = features_of(generator, bag)
+    with torch.no_grad():
+        whole = layer(features, bag)
+        parts = list(exchange_in_parts(layer, iter(features.split(at_once)), bag, at_once))
+    assert [len(part) for part in parts] == [len(part) for part in features.split(at_once)]
+    torch.testing.assert_close(torch.cat(parts), whole)
 
 
 @pytest.mark.parametrize("kind", GRAPH_LAYERS)

@@ -78,6 +78,24 @@ def test_splitting_or_joining_bags_changes_no_logits(kind, encoder, seed, sizes,
 
 @KINDS
 @pytest.mark.parametrize("encoder", ENCODERS)
+def test_many_robots_are_read_in_parts_with_the_same_logits(kind, encoder, monkeypatch):
+    generator = np.random.default_rng(0)
+    policy = seeded_policy(0, encoder=encoder, taps=3, **kind)
+    bag = bags.random_bag(generator, [5, 30, 2], policy.config, weighted=True)
+    with torch.no_grad():
+        whole = policy(bag)
+        monkeypatch.setattr("gnn_policy.network._AT_ONCE", 7)
+        sizes = list[int]()
+        extract = policy.extract
+        monkeypatch.setattr(policy, "extract", lambda fov, *rest: sizes.append(len(fov)) or extract(fov, *rest))
+        torch.testing.assert_close(policy(bag), whole, rtol=1e-4, atol=1e-5)
+    assert sizes == [7] * 5 + [2]
+    policy.train()(bag)
+    assert sizes[-1] == 37  # batch norm is trained on all robots
+
+
+@KINDS
+@pytest.mark.parametrize("encoder", ENCODERS)
 @few
 @given(seed=st.integers(0, 2**32 - 1), sizes=sizes, taps=st.integers(1, 4), directed=st.booleans())
 def test_permuting_robots_permutes_logits(kind, encoder, seed, sizes, taps, directed):
