@@ -49,7 +49,7 @@ struct WayTables {
                (col + layout.border - corner[1]);
     }
 
-    // Whether the table covers all cells at most `radius` rows and columns away.
+    // Returns true if the table covers all cells at most `radius` rows and columns away.
     bool covers(const Layout& layout, int robot, int row, int col, int radius) const {
         const int top = row + layout.border - corners[2 * robot], left = col + layout.border - corners[2 * robot + 1];
         return top >= radius && left >= radius && top + radius < shape.rows && left + radius < shape.cols;
