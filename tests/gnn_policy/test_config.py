@@ -145,7 +145,7 @@ def test_a_settings_file_needs_only_what_differs_from_the_defaults(tmp_path):
     [
         "{",
         "rounds = ",
-        "rounds = 1\nepochs = 2",
+        "rounds = 1\nrounds = 2",
         "policy = 1",
         "execution = []",
         "families = 3",
