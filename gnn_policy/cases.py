@@ -41,6 +41,8 @@ class Family:
     "warehouse" and "empty"."""
     share: float = 1.0
     """Share of the maps, relative to the other families' shares."""
+    task: Task = "one_shot"
+    """"lifelong": a robot that arrives gets a new goal."""
     height: Range = (20, 20)
     """Rows of a map."""
     width: Range = (20, 20)
@@ -130,9 +132,20 @@ class Cases:
     """(C,) the map of each case."""
     family_of: npt.NDArray[np.int32]
     """(C,) the family of each case."""
+    lifelong: npt.NDArray[np.bool_]
+    """(C,) cases in which a robot that arrives gets a new goal."""
 
     def __len__(self) -> int:
         return len(self.instances)
+
+    def by_task(self) -> dict[Task, Cases]:
+        """Return the cases of each task that occurs, on the same maps."""
+        chosen = {task: np.flatnonzero(self.lifelong == (task == "lifelong")) for task in get_args(Task)}
+        return {task: self._take(cases) for task, cases in chosen.items() if len(cases)}
+
+    def _take(self, cases: npt.NDArray[np.intp]) -> Cases:
+        instances = [self.instances[case] for case in cases]
+        return Cases(instances, self.grids, self.map_of[cases], self.family_of[cases], self.lifelong[cases])
 
 
 def make_cases(split: Split, *, seed: int, maps: int, cases_per_map: int, families: Sequence[Family]) -> Cases:
@@ -150,19 +163,19 @@ def make_cases(split: Split, *, seed: int, maps: int, cases_per_map: int, famili
         raise ValueError(f"the {split} split needs at least one map and one case a map, got {maps} and {cases_per_map}")
     stream = mix(np.array([seed], np.uint64), np.array([get_args(Split).index(split)], np.uint64))
     map_seeds = mix(np.repeat(stream, maps), np.arange(maps, dtype=np.uint64))
-    family_of = family_turns(families, maps)
+    family_of = _turns(np.array([each.share for each in families]), maps)
     grids = _draw_maps([families[f] for f in family_of], map_seeds)
     map_of = np.repeat(np.arange(maps, dtype=np.int32), cases_per_map)
     numbers = np.tile(np.arange(cases_per_map, dtype=np.uint64), maps)
     case_seeds = mix(np.repeat(map_seeds, cases_per_map), numbers)
     robots = [_robots(families[family_of[m]], grids[m], int(s)) for m, s in zip(map_of, case_seeds, strict=True)]
-    return Cases(_place(grids, map_of, robots, case_seeds), grids, map_of, family_of[map_of])
+    lifelong = np.array([family.task == "lifelong" for family in families])[family_of[map_of]]
+    return Cases(_place(grids, map_of, robots, case_seeds), grids, map_of, family_of[map_of], lifelong)
 
 
-def family_turns(families: Sequence[Family], count: int) -> npt.NDArray[np.int32]:
+def _turns(shares: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.int32]:
     """Return the family (count,) of each map: always the one that is furthest behind its share."""
-    shares = np.array([family.share for family in families])
-    shares /= shares.sum()
+    shares = shares / shares.sum()
     given = np.zeros(len(shares))
     turns = np.empty(count, np.int32)
     for number in range(count):
@@ -205,7 +218,14 @@ def _place(
 
 
 def cases_of_files(
-    split: Split, files: Sequence[str], *, seed: int, cases_per_map: int, num_agents: int, whole: bool = False
+    split: Split,
+    files: Sequence[str],
+    *,
+    seed: int,
+    cases_per_map: int,
+    num_agents: int,
+    task: Task = "one_shot",
+    whole: bool = False,
 ) -> Cases:
     """Return the cases of a split of the user's own maps, scenarios and sets of instances.
 
@@ -242,7 +262,8 @@ def cases_of_files(
             f"{', '.join(files)} leave no case for the {split} split: give more instances, or maps (.map), on which "
             "starts and goals are drawn"
         )
-    return Cases(instances, grids, np.array(map_of, np.int32), np.zeros(len(instances), np.int32))
+    lifelong = np.full(len(instances), task == "lifelong")
+    return Cases(instances, grids, np.array(map_of, np.int32), np.zeros(len(instances), np.int32), lifelong)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,11 +6,11 @@ import math
 import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import tomli_w
 
-from gnn_policy.cases import Cases, Family, Split, Task, cases_of_files, family_turns, make_cases
+from gnn_policy.cases import Cases, Family, Split, Task, cases_of_files, make_cases
 from gnn_policy.execution import Actions, Execution
 from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.settings import check_types
@@ -47,7 +47,8 @@ class TrainConfig:
     """Obstacles: independent "cells", short "walls" as the authors' generator makes them, or "maze", "room",
     "warehouse" and "empty", which ignore the density; the maps of a split take turns among the styles."""
     task: Task = "one_shot"
-    """"lifelong": a robot that arrives gets a new goal, and validation and evaluation measure throughput."""
+    """"lifelong": a robot that arrives gets a new goal, and validation and evaluation measure throughput. Families
+    have tasks of their own."""
     families: tuple[Family, ...] = ()
     """Families of random cases with ranges of sizes, densities and team sizes, instead of the five settings above; in a
     configuration file, one [[families]] table for each."""
@@ -203,19 +204,6 @@ class TrainConfig:
             raise ValueError(f"w must be at least 1 and finite, got {self.w}")
         if self.updates_per_round is not None and self.updates_per_round < 1:
             raise ValueError(f"updates_per_round must be at least 1, got {self.updates_per_round}")
-        if not self.files and len(self.case_families) > 1:
-            for split in get_args(Split):
-                self._require_a_map_of_each_family(split)
-
-    def _require_a_map_of_each_family(self, split: Split) -> None:
-        families, (maps, _) = self.case_families, self.size_of(split)
-        missing = {*range(len(families))} - {*family_turns(families, maps).tolist()}
-        if missing:
-            first = families[min(missing)]
-            raise ValueError(
-                f"{split}_maps = {maps} leaves {len(missing)} of {len(families)} families without a map, the first of "
-                f'them style "{first.style}" with share {first.share:g}: give more maps, or fewer families'
-            )
 
     @property
     def rollout_execution(self) -> Execution:
@@ -230,14 +218,20 @@ class TrainConfig:
             width=(self.width, self.width),
             density=(self.density, self.density),
             num_agents=(self.num_agents, self.num_agents),
+            task=self.task,
         )
         return self.families or tuple(replace(alike, style=style) for style in self.styles)
+
+    @property
+    def tasks(self) -> set[Task]:
+        """The tasks of the cases."""
+        return {self.task} if self.files else {family.task for family in self.case_families}
 
     def cases(self, split: Split, *, whole: bool = False) -> Cases:
         """Return the cases of a split; with `whole` all cases of the files, if there are files.
 
         Raises:
-            ValueError: If there is no room for the robots, or a file does not fit.
+            ValueError: If a family has no map or no room for its robots, or a file does not fit.
             OSError: If a file cannot be read.
         """
         maps, cases_per_map = self.size_of(split)
@@ -248,11 +242,19 @@ class TrainConfig:
                 seed=self.data_seed,
                 cases_per_map=cases_per_map,
                 num_agents=self.num_agents,
+                task=self.task,
                 whole=whole,
             )
-        return make_cases(
-            split, seed=self.data_seed, maps=maps, cases_per_map=cases_per_map, families=self.case_families
-        )
+        families = self.case_families
+        cases = make_cases(split, seed=self.data_seed, maps=maps, cases_per_map=cases_per_map, families=families)
+        missing = {*range(len(families))} - {*cases.family_of.tolist()}
+        if missing:
+            first = families[min(missing)]
+            raise ValueError(
+                f"{split}_maps = {maps} leaves {len(missing)} of {len(families)} families without a map, the first of "
+                f'them style "{first.style}" with share {first.share:g}: give more maps, or fewer families'
+            )
+        return cases
 
     def size_of(self, split: Split) -> tuple[int, int]:
         """Return the number of maps of a split, and of cases on each."""

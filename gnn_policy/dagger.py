@@ -8,7 +8,7 @@ that of the paper's released code.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -20,8 +20,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector
 
 from gnn_policy.acting import scores_of
-from gnn_policy.cases import Cases
-from gnn_policy.config import Backend, TrainConfig
+from gnn_policy.cases import Cases, Task
+from gnn_policy.config import Aggregation, Backend, TrainConfig
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.execution import episode_noise
 from gnn_policy.labelling import Labeller
@@ -122,8 +122,84 @@ def teams_side_by_side(config: TrainConfig, process: Process) -> int:
     return teams
 
 
+def _split_teams(teams: int, by_task: Mapping[Task, Cases], collectors: int) -> dict[Task, int]:
+    """Return the teams of each task, in proportion to its cases and at least one for each collector.
+
+    Raises:
+        ValueError: If a collector has fewer teams than there are tasks.
+    """
+    each = teams // collectors
+    if each < len(by_task):
+        raise ValueError(
+            f"rollout_teams must be at least {len(by_task)} for each collector, one for each task, got {each}"
+        )
+    if len(by_task) == 1:
+        return dict.fromkeys(by_task, teams)
+    one_shot, lifelong = (len(by_task[task]) for task in ("one_shot", "lifelong"))
+    share = min(max(round(each * lifelong / (one_shot + lifelong)), 1), each - 1)
+    return {"one_shot": (each - share) * collectors, "lifelong": share * collectors}
+
+
+class _Player:
+    """Plays the cases of one task through a TorchRL collector."""
+
+    def __init__(
+        self, config: TrainConfig, policy: DecentralizedPolicy, labeller: Labeller, task: Task, cases: Cases, teams: int
+    ) -> None:
+        self._config, self._map_of = config, cases.map_of
+        self._mixture = Mixture(policy, labeller, config, cases)
+        self._mixture.begin(beta=1.0, seed=0)
+        make_env = functools.partial(
+            TeamEnv,
+            teams // config.collectors,
+            cases.instances,
+            observation="state",
+            task=task,
+            max_cycles=config.rollout_length,
+            dtype="uint8",
+            **config.rollout_execution.env_settings(config.policy),
+        )
+        self._collector = _collector(
+            config.backend,
+            config.collectors,
+            make_env,
+            self._mixture,
+            frames_per_batch=teams * config.rollout_length,
+            reset_at_each_iter=True,
+            trust_policy=True,
+        )
+        self._batches: Iterator[TensorDictBase] = iter(self._collector)
+
+    def play(self, beta: float, seed: int, times: int, mining: int, *, only_stuck: bool) -> States:
+        """Play the teams `times` times for each one that is kept, and return the states of those.
+
+        With `mining` above 1 the one in so many is kept that arrived last. With `only_stuck` only the last states of
+        teams that did not arrive are returned.
+        """
+        self._mixture.begin(beta, seed)
+        if self._config.backend != "direct":
+            self._collector.update_policy_weights_(self._mixture)
+        self._collector.set_seed(seed)
+        parts: list[TensorDictBase] = []
+        for _ in range(mining * times):
+            # Collectors side by side are stacked.
+            visited = next(self._batches).reshape(-1, self._config.rollout_length)
+            parts.append(visited.select(*STATE_KEYS, ("next", "truncated"), ("next", "terminated")).clone())
+        played: Any = torch.cat(parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        arrived = np.asarray(played["next", "terminated"]).reshape(len(played), -1).any(axis=1)
+        teams = np.sort(arrived.argsort(kind="stable")[: len(played) // mining])
+        chosen = played[torch.from_numpy(teams)].reshape(-1)
+        if only_stuck:
+            chosen = chosen[chosen["next", "truncated"][:, 0]]
+        return states_of(chosen, self._map_of)
+
+    def close(self) -> None:
+        """Shut the collector down."""
+        self._collector.shutdown()
+
+
 class Demonstrator:
-    """Collects demonstrations round by round through a TorchRL collector."""
+    """Collects demonstrations round by round: teams of each task, as many as its share of the cases."""
 
     def __init__(
         self,
@@ -135,29 +211,9 @@ class Demonstrator:
     ) -> None:
         self._config, self._labeller, self._cases, self._map_of = config, labeller, cases, cases.map_of
         self._rank, self._num_processes = process.rank, process.count
-        teams, players = teams_side_by_side(config, process), config.collectors
-        self._mixture = Mixture(policy, labeller, config, cases)
-        self._mixture.begin(beta=1.0, seed=0)
-        make_env = functools.partial(
-            TeamEnv,
-            teams // players,
-            cases.instances,
-            observation="state",
-            task=config.task,
-            max_cycles=config.rollout_length,
-            dtype="uint8",
-            **config.rollout_execution.env_settings(config.policy),
-        )
-        self._collector = _collector(
-            config.backend,
-            players,
-            make_env,
-            self._mixture,
-            frames_per_batch=teams * config.rollout_length,
-            reset_at_each_iter=True,
-            trust_policy=True,
-        )
-        self._batches: Iterator[TensorDictBase] = iter(self._collector)
+        by_task = cases.by_task()
+        teams = _split_teams(teams_side_by_side(config, process), by_task, config.collectors)
+        self._players = [_Player(config, policy, labeller, task, own, teams[task]) for task, own in by_task.items()]
 
     def collect(self, round_number: int, steps: int) -> tuple[Demonstrations, int]:
         """Play this process's share of at least `steps` team steps and label them.
@@ -172,33 +228,26 @@ class Demonstrator:
         if round_number == 0 and self._config.aggregation == "plans":
             starts = self._starts(steps, np.random.default_rng(seed))
             return self._labeller.demonstrate(starts, self._config.plan_steps)
-        self._mixture.begin(self._config.beta_decay**round_number, seed)
-        if self._config.backend != "direct":
-            self._collector.update_policy_weights_(self._mixture)
-        self._collector.set_seed(seed)
         config, demonstrated = self._config, round_number == 0
         aggregation = "visited" if demonstrated else config.aggregation
-        mining = 1 if demonstrated else config.hard_case_mining
-        parts: list[TensorDictBase] = []
-        for _ in range(mining * -(-steps // (config.rollout_teams * config.rollout_length))):
-            visited = next(self._batches).reshape(-1, config.rollout_length)  # collectors side by side are stacked
-            parts.append(visited.select(*STATE_KEYS, ("next", "truncated"), ("next", "terminated")).clone())
-        played: Any = torch.cat(parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
-        arrived = np.asarray(played["next", "terminated"]).reshape(len(played), -1).any(axis=1)
-        teams = np.sort(arrived.argsort(kind="stable")[: len(played) // mining])
-        chosen = played[torch.from_numpy(teams)].reshape(-1)
+        beta, mining = config.beta_decay**round_number, 1 if demonstrated else config.hard_case_mining
+        times = -(-steps // (config.rollout_teams * config.rollout_length))
+        labelled = [
+            self._label(player.play(beta, seed, times, mining, only_stuck=aggregation == "stuck"), aggregation, seed)
+            for player in self._players
+        ]
+        return Demonstrations.concatenate([part for part, _ in labelled]), sum(count for _, count in labelled)
+
+    def _label(self, states: States, aggregation: Aggregation, seed: int) -> tuple[Demonstrations, int]:
+        config = self._config
         if aggregation == "stuck":
-            chosen = chosen[chosen["next", "truncated"][:, 0]]
-            return self._labeller.demonstrate(states_of(chosen, self._map_of))
-        if aggregation == "plans":
-            states = states_of(chosen, self._map_of)
-            weight = np.where(np.logical_or.reduceat(states.stuck(), states.offsets[:-1]), config.stuck_weight, 1.0)
-            count = max(len(states) // config.plan_steps, 1)
-            chosen_starts = np.random.default_rng(seed).choice(
-                len(states), count, replace=False, p=weight / weight.sum()
-            )
-            return self._labeller.demonstrate(states.take(np.sort(chosen_starts)), config.plan_steps)
-        return self._labeller.label(states_of(chosen, self._map_of))
+            return self._labeller.demonstrate(states)
+        if aggregation == "visited":
+            return self._labeller.label(states)
+        weight = np.where(np.logical_or.reduceat(states.stuck(), states.offsets[:-1]), config.stuck_weight, 1.0)
+        count = max(len(states) // config.plan_steps, 1)
+        asked = np.random.default_rng(seed).choice(len(states), count, replace=False, p=weight / weight.sum())
+        return self._labeller.demonstrate(states.take(np.sort(asked)), config.plan_steps)
 
     def _starts(self, steps: int, rng: np.random.Generator) -> States:
         """Return the starts of as many cases as have plans of about so many steps."""
@@ -213,5 +262,6 @@ class Demonstrator:
         )
 
     def close(self) -> None:
-        """Shut the collector down."""
-        self._collector.shutdown()
+        """Shut the collectors down."""
+        for player in self._players:
+            player.close()

@@ -112,7 +112,8 @@ def _evaluate(command: Command) -> None:
     if command.files and len(command.num_agents) > 1:
         raise ValueError("files have their own teams: give one --num-agents at most, for maps without instances")
     if command.task is not None:
-        given["task"] = command.task
+        families = given.get("families", trained.families)
+        given |= {"task": command.task, "families": tuple(replace(each, task=command.task) for each in families)}
     config = replace(trained, **given)
     execution = checkpoint.executed_as(command.policy)
     executions = default_executions(execution)
@@ -122,7 +123,7 @@ def _evaluate(command: Command) -> None:
     folder = command.out or _home(command.policy)
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"{folder} is not a folder: give another one with --out")
-    settings = settings_of(config, command.num_agents, executions, command.split, config.task)
+    settings = settings_of(config, command.num_agents, executions, command.split)
     refuse_other_settings(folder / "results.json", settings, "--out")
 
     import torch
@@ -141,7 +142,6 @@ def _evaluate(command: Command) -> None:
         num_agents=command.num_agents,
         executions=executions,
         split=command.split,
-        task=config.task,
         whole=bool(command.files),
         steps=command.steps,
         threads=threads,

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from gnn_policy import checkpoint, metrics
-from gnn_policy.cases import Split, Task
+from gnn_policy.cases import Split
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.failures import count_failures, worst
@@ -37,13 +37,14 @@ def evaluate_and_report(
     num_agents: Sequence[int] = (),
     executions: Sequence[Execution] | None = None,
     split: Split = "test",
-    task: Task = "one_shot",
     steps: int = metrics.LIFELONG_STEPS,
     whole: bool = False,
     threads: int,
     failures: int = 0,
 ) -> None:
     """Print one table for each team size; write animation.svg and results.json into `folder`.
+
+    Cases of lifelong tasks have a table of throughput, without the expert.
 
     Each team size is written when it is finished, results.json last. If results.json already holds some of the sizes,
     as after a kill, only the others are played; a complete one is computed again.
@@ -56,7 +57,6 @@ def evaluate_and_report(
         num_agents: Team sizes N; those of `config` if none is given.
         executions: How to execute the policy, one row for each; `default_executions(policy.execution)` if not given.
         split: Which maps.
-        task: "lifelong" shows throughput, without the expert.
         steps: Steps of a lifelong episode.
         whole: Play all cases of the files, including those that training on them would use.
         threads: CPU threads of the expert.
@@ -73,25 +73,26 @@ def evaluate_and_report(
         raise ValueError("executions is empty: give at least one execution")
     if failures < 0:
         raise ValueError(f"failures must not be negative, got {failures}")
-    if failures and task == "lifelong":
+    if failures and "lifelong" in config.tasks:
         raise ValueError("a lifelong team cannot fail: leave failures out")
     settings = {
         "policy": checkpoint.fingerprint(policy),
-        **settings_of(config, num_agents, executions, split, task),
-        **({"steps": steps} if task == "lifelong" else {}),
+        **settings_of(config, num_agents, executions, split),
+        **({"steps": steps} if "lifelong" in config.tasks else {}),
     }
     cases, numbers = tables_of(config, num_agents), folder / "results.json"
     refuse_other_settings(numbers, settings, "--out")
     tables = read_tables(numbers)
     finished = set() if failures or tables.keys() >= cases.keys() else tables.keys() & cases.keys()
     instances = {name: each.cases(split, whole=whole).instances for name, each in cases.items() if name not in finished}
-    make_table = metrics.table if task == "one_shot" else metrics.lifelong_table
-    baselines = metrics.BASELINES if task == "one_shot" else metrics.LIFELONG_BASELINES
+    lifelong = {name: each.tasks == {"lifelong"} for name, each in cases.items()}
+    baselines = {name: metrics.LIFELONG_BASELINES if lifelong[name] else metrics.BASELINES for name in instances}
     scenes: list[Scene] = []
     with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task("", total=len(instances) * (len(executions) + len(baselines)))
+        bar = progress.add_task("", total=sum(len(executions) + len(each) for each in baselines.values()))
         for name in cases:
             title = table_title(name, settings)
+            make_table = metrics.lifelong_table if lifelong[name] else metrics.table
             if name in finished:
                 console.print(make_table(title, tables[name]))
                 continue
@@ -99,7 +100,7 @@ def evaluate_and_report(
             def advance(phase: str, title: str = title) -> None:
                 progress.update(bar, description=f"{title}: {phase}", advance=1)
 
-            if task == "lifelong":
+            if lifelong[name]:
                 tables[name], rollouts = metrics.compare_lifelong(
                     instances[name], policy, executions, steps=steps, seed=config.seed, progress=advance
                 )
@@ -133,7 +134,7 @@ def _animate(rollouts: Sequence[Rollouts], path: Path) -> None:
     lifelong = len(best.goals[case]) > 1
     outcome = "all on goal" if best.success[case] else "timed out"
     if lifelong:
-        outcome = f"{best.throughput[case]:.2f} arrivals per step"
+        outcome = f"{best.throughput[case]:.2f} arbaselines per step"
     title = f"Trained policy, {best.instances[case].num_agents} robots: {outcome}"
     goals = best.goals[case] if lifelong else None
     animate(best.instances[case], best.solutions[case], path, title=title, goals=goals)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,24 +42,34 @@ class Round:
     validation_flowtime_increase: float | None = None
     """Flowtime increase on the validation cases, over all cases."""
     validation_throughput: float | None = None
-    """Arrivals per step on the validation cases of a lifelong training."""
+    """Arrivals per step on the validation cases of lifelong tasks."""
 
     @property
-    def validation(self) -> float | None:
-        """The success rate or the throughput on the validation cases, if they were played in this round."""
-        return self.validation_success if self.validation_throughput is None else self.validation_throughput
+    def merit(self) -> tuple[float, float] | None:
+        """What the best policy is chosen by, if validation cases were played in this round.
+
+        The success rate times the throughput, or the one that was measured, then the smaller flowtime increase.
+        """
+        measured = [each for each in (self.validation_success, self.validation_throughput) if each is not None]
+        return (math.prod(measured), -(self.validation_flowtime_increase or 0.0)) if measured else None
 
 
 def draw_learning_curve(rounds: Sequence[Round], path: Path) -> None:
-    """Draw validation success, or throughput, and training loss against the robot states trained on, as PNG."""
+    """Draw validation success, throughput and training loss against the robot states trained on, as PNG."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    validated = [row for row in rounds if row.validation is not None]
-    left.plot([row.samples / 1e6 for row in validated], [row.validation for row in validated], "o-", color="#1f6feb")
-    if any(row.validation_throughput is not None for row in validated):
-        left.set(title="validation throughput", ylim=(0, None), ylabel="arrivals per step")
-    else:
-        left.set(title="validation success", ylim=(0, 1), ylabel="success rate")
+    judged = [row for row in rounds if row.merit is not None]
+    measured = [
+        ("success rate", "#1f6feb", 1.0, [row.validation_success for row in judged]),
+        ("arrivals per step", "#1a7f37", None, [row.validation_throughput for row in judged]),
+    ]
+    shown = [each for each in measured if each[-1] and None not in each[-1]]
+    for number, (label, colour, top, values) in enumerate(shown):
+        axes = left.twinx() if number else left
+        axes.plot([row.samples / 1e6 for row in judged], values, "o-", color=colour)
+        axes.set(ylim=(0, top))
+        axes.set_ylabel(label, color=colour)
+    left.set(title="validation")
     samples = [row.samples / 1e6 for row in rounds]
     right.plot(samples, [row.loss for row in rounds], color="#d1570b", label="loss")
     right.plot(samples, [row.accuracy for row in rounds], color="#57606a", label="accuracy")

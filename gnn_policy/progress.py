@@ -67,11 +67,11 @@ class TrainingProgress:
     def finished(self, row: Round) -> None:
         """Show a round that is finished and saved."""
         self._bar.update(self._task, completed=row.round + 1)
-        if row.validation is not None:
-            self._validation = f"{row.validation:.3f}"
-            kind = "success" if row.validation_throughput is None else "throughput"
+        measured = {"success": row.validation_success, "throughput": row.validation_throughput}
+        if row.merit is not None:
+            self._validation = ", ".join(f"{kind} {value:.3f}" for kind, value in measured.items() if value is not None)
             self._console.print(
                 f"round {row.round + 1:3}  {row.seconds / 60:4.1f} min  {row.samples / 1e6:5.1f}M robot states  "
-                f"loss {row.loss:.3f}  validation {kind} {self._validation}",
+                f"loss {row.loss:.3f}  validation {self._validation}",
                 highlight=False,
             )

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from gnn_policy.cases import Split, Task
+from gnn_policy.cases import Split
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Actions, Execution
 from mapf_env.files import write_whole
@@ -30,7 +30,6 @@ def settings_of(
     num_agents: Sequence[int],
     executions: Sequence[Execution],
     split: Split,
-    task: Task = "one_shot",
 ) -> dict[str, Any]:
     """Return everything that the numbers depend on, except for the policy."""
     maps, cases_per_map = config.size_of(split)
@@ -39,7 +38,7 @@ def settings_of(
         "executions": [execution.name for execution in executions],
         "tables": list(tables_of(config, num_agents)),
         "split": split,
-        "task": task,
+        "task": config.task,
         "maps": maps,
         "cases_per_map": cases_per_map,
         "styles": list(config.styles),

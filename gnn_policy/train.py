@@ -16,7 +16,7 @@ from gnn_policy.command_line import parse_options, run_command
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
 from gnn_policy.recipes import RECIPES, Recipe
-from gnn_policy.results_file import default_executions, read_tables, settings_of, table_title
+from gnn_policy.results_file import default_executions, read_tables, settings_of, table_title, tables_of
 from gnn_policy.run_folder import RESULTS, check_run, is_finished
 
 if TYPE_CHECKING:
@@ -73,12 +73,12 @@ def parse(arguments: Sequence[str]) -> Command:
 
 def _refuse_unused(config: TrainConfig, defaults: TrainConfig) -> None:
     """Raise ValueError if an option was given that files or families of cases leave without effect."""
-    unused = ("height", "width", "density", "styles")
+    unused: tuple[str, ...] = ("height", "width", "density", "styles")
     if config.files:
         source, cure = "files", "the maps are those of the files"
     elif config.families:
         source, cure = "families", "change the [[families]] of a file of settings and give it with --config"
-        unused += ("num_agents",)
+        unused += ("num_agents", "task")
     else:
         return
     for name in unused:
@@ -110,9 +110,10 @@ def _start(command: Command) -> None:
 def _show_finished(folder: Path, config: TrainConfig) -> None:
     from gnn_policy.metrics import lifelong_table, table
 
-    console, settings = Console(), settings_of(config, (), default_executions(config.execution), "test", config.task)
-    show = table if config.task == "one_shot" else lifelong_table
+    console, settings = Console(), settings_of(config, (), default_executions(config.execution), "test")
+    shown = tables_of(config, ())
     for name, result in read_tables(folder / RESULTS).items():
+        show = lifelong_table if shown[name].tasks == {"lifelong"} else table
         console.print(show(table_title(name, settings), result))
     console.print(
         f"{folder} holds a finished run: choose another folder with --run to train again",
@@ -143,9 +144,7 @@ def _train(config: TrainConfig, folder: Path, console: Console, process: Process
             return
         # The command line, which the run's settings agree with, has asked for its parts.
         policy = checkpoint.load(folder, plugins=tuple(config.policy.plugins.values()))
-        evaluate_and_report(
-            on_device(policy, config.device), config, folder, console, task=config.task, threads=training.threads
-        )
+        evaluate_and_report(on_device(policy, config.device), config, folder, console, threads=training.threads)
     console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
     console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)
 

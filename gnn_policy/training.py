@@ -35,6 +35,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
 from gnn_policy import checkpoint, metrics
+from gnn_policy.cases import Task
 from gnn_policy.command_line import on_device
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
@@ -52,6 +53,9 @@ from gnn_policy.progress import TrainingProgress
 from gnn_policy.rollout import rollout
 from gnn_policy.run_folder import lock_run, open_run
 from mapf_env.files import replacing
+
+References = dict[Task, metrics.ReferenceSet]
+"""The validation cases of each task."""
 
 
 class Training:
@@ -111,7 +115,8 @@ class Training:
         self._seconds_before = 0.0
         self._clock, self._began = clock, clock()
         self._cases = config.cases("train")
-        self._validation = config.cases("validation").instances
+        self._validation = config.cases("validation").by_task()
+        config.cases("test")  # which the final evaluation would refuse after all the work
         self._labeller = Labeller(
             self._cases.grids,
             solver=config.expert,
@@ -144,7 +149,7 @@ class Training:
     def run(self) -> None:
         """Train all remaining rounds."""
         config, first = self.config, self.process.rank == 0
-        reference = self._reference_set() if first else None
+        references = self._reference_sets() if first else None
         batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
         demonstrator = Demonstrator(config, self._player, self._labeller, self._cases, self.process)
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
@@ -152,7 +157,7 @@ class Training:
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
             for number in range(len(self.history), config.rounds):
-                row = self._run_round(number, demonstrator, batches, reference)
+                row = self._run_round(number, demonstrator, batches, references)
                 self.history.append(row)
                 if writer is not None:
                     for name, value in asdict(row).items():
@@ -172,16 +177,23 @@ class Training:
                 writer.close()
                 self._lock.release()
 
-    def _reference_set(self) -> metrics.ReferenceSet:
-        config = self.config
-        if config.task == "lifelong":
-            return metrics.ReferenceSet.without_expert(self._validation, metrics.LIFELONG_STEPS)
-        return metrics.ReferenceSet.prepare(
-            self._validation, w=config.w, timeout=config.timeout, threads=self.threads, nodes=config.reference_nodes
-        )
+    def _reference_sets(self) -> References:
+        config, sets = self.config, {}
+        for task, cases in self._validation.items():
+            if task == "lifelong":
+                sets[task] = metrics.ReferenceSet.without_expert(cases.instances, metrics.LIFELONG_STEPS)
+            else:
+                sets[task] = metrics.ReferenceSet.prepare(
+                    cases.instances,
+                    w=config.w,
+                    timeout=config.timeout,
+                    threads=self.threads,
+                    nodes=config.reference_nodes,
+                )
+        return sets
 
     def _run_round(
-        self, number: int, demonstrator: Demonstrator, batches: BatchMaker, reference: metrics.ReferenceSet | None
+        self, number: int, demonstrator: Demonstrator, batches: BatchMaker, references: References | None
     ) -> Round:
         config = self.config
         began, expert_seconds, unlabelled = self._clock(), self._labeller.seconds, 0
@@ -224,9 +236,9 @@ class Training:
             demonstrations=len(demonstrations),
             unlabelled=unlabelled,
         )
-        if reference is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.rounds):
+        if references is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.rounds):
             self.progress.phase(number, "validation")
-            self._validate(row, reference)
+            self._validate(row, references)
         row.seconds = self._seconds_before + self._clock() - self._began
         return row
 
@@ -334,28 +346,25 @@ class Training:
         own = batch[self.process.rank :: self.process.count]
         return np.array_split(own, parts if len(own) >= 4 else 1)
 
-    def _validate(self, row: Round, reference: metrics.ReferenceSet) -> None:
-        played = rollout(
-            self._player,
-            reference.instances,
-            task=self.config.task,
-            execution=self.config.rollout_execution,
-            max_steps=reference.max_steps,
-            seed=self.config.seed,
-        )
-        if self.config.task == "lifelong":
-            row.validation_throughput = float(played.throughput.mean())
-        else:
-            result = metrics.score("validation", reference, played)
-            row.validation_success = result.success_rate.mean
-            row.validation_flowtime_increase = result.flowtime_increase.mean
-        best = [each for each in self.history if each.validation is not None]
-        if all(self._merit(row) > self._merit(each) for each in best):
+    def _validate(self, row: Round, references: References) -> None:
+        for task, reference in references.items():
+            played = rollout(
+                self._player,
+                reference.instances,
+                task=task,
+                execution=self.config.rollout_execution,
+                max_steps=reference.max_steps,
+                seed=self.config.seed,
+            )
+            if task == "lifelong":
+                row.validation_throughput = float(played.throughput.mean())
+            else:
+                result = metrics.score("validation", reference, played)
+                row.validation_success = result.success_rate.mean
+                row.validation_flowtime_increase = result.flowtime_increase.mean
+        before = [each.merit for each in self.history if each.merit is not None]
+        if row.merit is not None and all(row.merit > each for each in before):
             checkpoint.save(self._player, self.folder / "best.safetensors", training=self.config.to_toml())
-
-    @staticmethod
-    def _merit(row: Round) -> tuple[float, float]:
-        return row.validation or 0.0, -(row.validation_flowtime_increase or 0.0)
 
     def _shard(self, number: int) -> Path:
         return self.folder / "demonstrations" / f"round_{number:04d}.safetensors"
@@ -374,7 +383,7 @@ class Training:
             table = csv.DictWriter(file, list(asdict(self.history[0])))
             table.writeheader()
             table.writerows(state["history"])
-        if self.history[-1].validation is not None:
+        if self.history[-1].merit is not None:
             with replacing(self.folder / "learning_curve.png") as draft:
                 draw_learning_curve(self.history, draft)
         with replacing(self.folder / "state.pt") as draft:

@@ -44,6 +44,7 @@ MIXED = replace(
 
 CROWDS = replace(
     MIXED,
+    families=(MIXED.families[0], replace(MIXED.families[1], task="lifelong")),
     aggregation="plans",
     plan_steps=4,
     stuck_weight=3.0,
@@ -53,7 +54,7 @@ CROWDS = replace(
     clip_norm=1.0,
     averaging=0.9,
 )
-"""The settings that the recipe for crowds adds."""
+"""The settings that the recipe for crowds adds, and lifelong tasks."""
 
 
 def arguments_for(config, folder):

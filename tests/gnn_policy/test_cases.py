@@ -82,6 +82,21 @@ def test_no_two_splits_or_seeds_share_a_random_map(families):
             seen |= grids
 
 
+def test_cases_of_lifelong_families_are_told_apart():
+    walls, lifelong = replace(PLAIN, style="walls"), replace(PLAIN, task="lifelong")
+    cases = make_cases("train", **{**SETTINGS, "families": [walls, lifelong]})
+    by_task = cases.by_task()
+    assert set(by_task) == {"one_shot", "lifelong"}
+    for number, (task, own) in enumerate(by_task.items()):
+        assert own.grids is cases.grids
+        assert (own.family_of == number).all()
+        assert (own.lifelong == (task == "lifelong")).all()
+        mine = cases.family_of == number
+        assert own.instances == [case for case, chosen in zip(cases.instances, mine, strict=True) if chosen]
+        assert np.array_equal(own.map_of, cases.map_of[mine])
+    assert set(make_cases("train", **{**SETTINGS, "families": [walls]}).by_task()) == {"one_shot"}
+
+
 def test_maps_take_turns_among_families_of_equal_shares():
     walls, cells = (replace(PLAIN, style=style) for style in ("walls", "cells"))
     both = maps_of(make_cases("train", **{**SETTINGS, "families": [walls, cells]}))

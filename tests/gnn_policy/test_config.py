@@ -223,7 +223,7 @@ def test_a_split_that_leaves_a_family_without_a_map_is_refused(split):
     with pytest.raises(
         ValueError, match=f'{split}_maps = 4 leaves 1 of 2 families without a map, the first of them style "maze"'
     ):
-        replace(enough, **{f"{split}_maps": 4})
+        replace(enough, **{f"{split}_maps": 4}).cases(split)
 
 
 def test_the_cases_of_files_are_of_the_files_and_of_the_seed(tmp_path):

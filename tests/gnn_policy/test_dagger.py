@@ -48,6 +48,12 @@ def mixed():
     return make_cases("train", seed=0, maps=6, cases_per_map=2, families=FAMILIES["mixed"])
 
 
+@pytest.fixture(scope="module")
+def both_tasks():
+    families = [replace(*FAMILIES["alike"], share=2.0), replace(*FAMILIES["alike"], task="lifelong", share=1.0)]
+    return make_cases("train", seed=0, maps=6, cases_per_map=2, families=families)
+
+
 @pytest.fixture
 def policy(cases):
     torch.manual_seed(0)
@@ -456,3 +462,33 @@ def test_the_mixture_reads_what_the_environment_writes(policy, cases):
     state = TeamEnv(2, cases.instances, observation="state").reset()
     assert isinstance(state, TensorDict)
     assert set(mixture.in_keys) <= set(state.keys(include_nested=True))
+
+
+def test_teams_of_both_tasks_play_side_by_side(policy, both_tasks):
+    """A team of a one-shot task keeps its goals; one of a lifelong task gets others."""
+    config = replace(CONFIG, rollout_teams=6, rollout_length=40, expert="lacam")
+    found = collected(config, policy, both_tasks, 0, 240)[0].states
+    assert len(found) >= 240
+    given = {
+        (int(number), task): {case.goals.tobytes() for case in own.instances}
+        for task, own in both_tasks.by_task().items()
+        for number in own.map_of
+    }
+    assert {task for _, task in given} == {"one_shot", "lifelong"}
+    kinds = Counter()
+    for t in range(len(found)):
+        goals = found.goals[found.offsets[t] : found.offsets[t + 1]].astype(np.int32).tobytes()
+        task = next(task for number, task in given if number == found.maps[t])
+        kinds[task, goals in given[int(found.maps[t]), task]] += 1
+    assert kinds["one_shot", False] == 0
+    assert kinds["lifelong", False] > 0
+    played = {task: sum(count for (own, _), count in kinds.items() if own == task) for task in ("one_shot", "lifelong")}
+    assert played["lifelong"] == 2 * 40, "two of six teams, as a third of the maps is theirs"
+    assert played["one_shot"] > 0
+
+
+def test_each_collector_has_a_team_for_each_task(policy, both_tasks):
+    with pytest.raises(
+        ValueError, match="rollout_teams must be at least 2 for each collector, one for each task, got 1"
+    ):
+        demonstrating(replace(CONFIG, rollout_teams=1), policy, both_tasks)

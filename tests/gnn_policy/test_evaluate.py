@@ -98,7 +98,6 @@ def test_every_option_reaches_the_evaluation(file, monkeypatch, tmp_path, split)
         "num_agents": (2, 5),
         "executions": [Execution(actions="stuck", temperature=0.5), Execution(shield="pibt", comm_range="connected")],
         "split": split,
-        "task": "one_shot",
         "steps": 256,
         "whole": False,
         "threads": 1,
@@ -148,6 +147,23 @@ def test_families_of_training_have_a_table_each_unless_a_map_is_given(file, monk
     ]
     config, _, _ = evaluated(monkeypatch, str(file), "--height", "9", "--out", str(file.parent / "high"))
     assert config == replace(CONFIG, height=9)
+
+
+def test_families_of_lifelong_tasks_have_tables_of_throughput_next_to_those_of_success(file, capsys):
+    both = (MIXED.families[0], replace(MIXED.families[1], task="lifelong"))
+    save(DecentralizedPolicy(CONFIG.policy), file, training=replace(CONFIG, families=both).to_toml())
+    for task, kinds in (None, ["success_rate", "throughput"]), ("lifelong", ["throughput", "throughput"]):
+        out = file.parent / str(task)
+        words = ["--threads", "1", "--executions", "argmax", "--steps", "20", "--out", str(out)]
+        evaluate.main([str(file), *words, *(["--task", task] if task else [])])
+        results = json.loads((out / "results.json").read_text())
+        for table, kind in zip(results["tables"].values(), kinds, strict=True):
+            assert {"success_rate", "throughput"} & table["rows"][0].keys() == {kind}
+        assert results["settings"]["steps"] == 20
+        assert "arrivals" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        evaluate.main([str(file), "--failures", "1", "--out", str(file.parent / "failures")])
+    assert "a lifelong team cannot fail" in capsys.readouterr().err
 
 
 def test_evaluations_of_other_families_are_not_mixed_up(file, capsys):

@@ -109,7 +109,7 @@ def test_goals_are_those_of_the_state(cases):
 
 def test_states_that_a_solver_does_not_solve_are_left_out():
     corridor = Instance(np.zeros((1, 4), bool), [(0, 0), (0, 3)], [(0, 3), (0, 0)])
-    cases = Cases([corridor], [corridor.grid], np.zeros(1, np.int32), np.zeros(1, np.int32))
+    cases = Cases([corridor], [corridor.grid], np.zeros(1, np.int32), np.zeros(1, np.int32), np.zeros(1, bool))
     positions = [corridor.starts, corridor.goals, corridor.starts]
     for name in ("pibt", "prioritised", "lacam", "ecbs"):
         labeller = labeller_for(cases, solver=name, node_limit=50)

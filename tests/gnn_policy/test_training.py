@@ -97,7 +97,7 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
         {"policy": replace(CONFIG.policy, graph_layer="own_layers:Forgetful")},
         {"families": MIXED.families, "augment": True, "beta_decay": 0.5},
         {
-            "families": MIXED.families,
+            "families": CROWDS.families,
             "rollout_actions": "stuck",
             "execution": Execution(actions="stuck", shield="pibt"),
         },
