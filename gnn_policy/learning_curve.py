@@ -46,7 +46,7 @@ class Round:
 
     @property
     def merit(self) -> tuple[float, float] | None:
-        """What the best policy is chosen by, if validation cases were played in this round.
+        """The measure that selects the best policy, if validation cases were played in this round.
 
         The success rate times the throughput, or the one that was measured, then the smaller flowtime increase.
         """
