@@ -15,6 +15,7 @@ from gnn_policy.checkpoint import WEIGHTS
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
+from gnn_policy.paper_rates import PAPER, TEAMS
 from gnn_policy.precision import Precision
 from gnn_policy.recipes import RECIPES
 from mapf_env.generation import MapStyle
@@ -22,15 +23,6 @@ from mapf_env.generation import MapStyle
 Step = Literal["all", "plan", "train", "test", "draw"]
 Kind = Literal["paper", "connected", "informed"]
 
-TEAMS: tuple[int, ...] = (4, 6, 8, 10, 12, 14)
-PAPER = {
-    4: (0.9431, 0.8518, 0.7531, 0.5980, 0.4909, 0.3642),
-    6: (0.9638, 0.9313, 0.8747, 0.7916, 0.7058, 0.6227),
-    8: (0.9676, 0.9442, 0.9140, 0.8547, 0.7842, 0.7042),
-    10: (0.9647, 0.9520, 0.9249, 0.8984, 0.8544, 0.8136),
-    12: (0.9696, 0.9542, 0.9347, 0.9082, 0.8791, 0.8302),
-}
-"""Figure 3 of the paper: success rate, a row for each size of the training teams, a column for each of TEAMS."""
 LONGER = {
     4: (0.9824, 0.9569, 0.9211, 0.8669, 0.8058, 0.7180),
     6: (0.9907, 0.9796, 0.9698, 0.9504, 0.9331, 0.9018),

@@ -14,10 +14,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from gnn_policy.paper_rates import PAPER, TEAMS
 from gnn_policy.recipes import RECIPES
+from gnn_policy.report import heat_map
 from mapf_env.files import replacing, write_whole
 from mapf_env.generation import MapStyle
-from paper_experiment import LARGEST, LONGER, PAPER, TEAMS, Experiment, Kind, Model, Scene
+from paper_experiment import LARGEST, LONGER, Experiment, Kind, Model, Scene
 
 MEASURES = {
     "success_rate": "Success: all robots on goal at once",
@@ -99,27 +101,6 @@ def _figure3(experiment: Experiment, style: MapStyle) -> Figure:
         axes.set_ylabel("robots in training")
     figure.suptitle(f"Figure 3, maps of {style}: success rate, K = 3")
     return figure
-
-
-def heat_map(
-    axes: Axes,
-    title: str,
-    values: np.ndarray,
-    rows: Sequence[object],
-    columns: Sequence[int],
-    *,
-    signed: bool = False,
-) -> None:
-    """Draw a cell for each pair of training and test teams, white where a number is missing; differences are signed."""
-    colours, low, high = ("PuOr_r", -0.5, 0.5) if signed else ("viridis", 0.3, 1.0)
-    axes.imshow(values, cmap=colours, vmin=low, vmax=high, aspect="auto")
-    for i, j in np.argwhere(np.isfinite(values)):
-        text = f"{values[i, j]:{'+' if signed else ''}.3f}".replace("0.", ".", 1)
-        dark = abs(values[i, j]) > 0.3 if signed else values[i, j] < 0.8
-        axes.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "black")
-    axes.set(title=title, xlabel="robots in test")
-    axes.set_xticks(range(len(columns)), list(map(str, columns)))
-    axes.set_yticks(range(len(rows)), list(map(str, rows)))
 
 
 def success_rates(experiment: Experiment, style: MapStyle, row: str) -> np.ndarray:

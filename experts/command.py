@@ -46,6 +46,11 @@ def main(arguments_given: Sequence[str] | None = None) -> int:
         return 130
 
 
+def solve(arguments_given: Sequence[str] | None = None) -> int:
+    """Run the part "solve" of the command; returns its exit status."""
+    return main(["solve", *(sys.argv[1:] if arguments_given is None else arguments_given)])
+
+
 def _in_one_line(error: Exception) -> str:
     """Return the message of an error; errors that are not about the input also show their type."""
     text = " ".join(str(error).split())

@@ -77,6 +77,7 @@ def draw_learning_curve(rounds: Sequence[Round], path: Path) -> None:
     right.legend(frameon=False)
     for axes in (left, right):
         axes.set(xlabel="robot states trained on, millions")
+        axes.locator_params(axis="x", nbins=5)
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=120, format="png")

@@ -260,7 +260,7 @@ def lifelong_table(title: str, result: dict[str, Any]) -> Table:
     shown.add_column("arrivals\nper step", justify="right", no_wrap=True)
     for row in result["rows"]:
         mean, high = row["throughput"]["mean"], row["throughput"]["high"]
-        shown.add_row(row["name"], f"{mean:.3f} ±{math.inf if high is None else high - mean:.3f}")
+        shown.add_row(row["name"], f"{mean:.3f}" + ("" if high is None else f" ±{high - mean:.3f}"))
     return shown
 
 
@@ -320,4 +320,4 @@ def _percent(estimate: dict[str, float | None]) -> str:
     mean, high = estimate["mean"], estimate["high"]
     if mean is None:
         return "-"
-    return f"{mean:+.1%} ±{math.inf if high is None else 100 * (high - mean):.1f}"
+    return f"{mean:+.1%}" + ("" if high is None else f" ±{100 * (high - mean):.1f}")

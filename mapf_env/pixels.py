@@ -55,6 +55,8 @@ class Screen:
         if sys.stdout.isatty() and self._lines:
             time.sleep(1 / self._fps)
             print(f"\x1b[{self._lines}F\x1b[J", end="")  # up to the first line of the picture before, and clear
+        elif self._lines:
+            print()  # an empty line between states in a pipe or a file
         print(shown, flush=True)
         self._lines = shown.count("\n") + 1
         return None

@@ -13,7 +13,8 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 import numpy.typing as npt
 
-from mapf_env import arguments, svg
+from mapf_env import arguments, rules, svg
+from mapf_env.config import EnvConfig
 from mapf_env.files import PathLike, write_whole
 from mapf_env.instance import Cells, Instance
 from mapf_env.solution import Solution
@@ -28,6 +29,7 @@ _FONT = "system-ui,-apple-system,Segoe UI,Roboto,Helvetica,Arial,sans-serif"
 
 _PAPER, _FLOOR, _WALL, _LINE, _FRAME = "#f6f7f9", "#ffffff", "#3b4252", "#e8ebef", "#cbd2da"
 _INK, _FAINT_INK, _WARNING = "#1f2530", "#667085", "#e60012"
+_SEEN, _HEARD = "#ffc400", "#d08700"
 
 
 def animate(
@@ -39,6 +41,8 @@ def animate(
     step_seconds: float = 0.4,
     pause_steps: int = 3,
     goals: npt.ArrayLike | None = None,
+    watched: int | None = None,
+    config: EnvConfig | None = None,
 ) -> str:
     """Return the robots driving along their paths, as an SVG that plays in a loop.
 
@@ -54,10 +58,12 @@ def animate(
         pause_steps: Pause on the first and on the last state, in steps.
         goals: The goals (T + 1, N, 2) at each time, `env.goals` after the reset and each step of a lifelong task; those
             of the instance at all times if not given.
+        watched: A robot whose field of view is shown, with lines to the robots that it hears.
+        config: The settings whose fov_radius, comm_radius and comm_range are shown; the paper's if not given.
 
     Raises:
-        ValueError: If the paths are of another number of agents or leave the map, a time is out of range, or the goals
-            do not belong to the paths.
+        ValueError: If the paths are of another number of agents or leave the map, a time is out of range, the goals
+            do not belong to the paths, or there is no robot `watched`.
         TypeError: If an argument has the wrong type.
         OSError: If the file cannot be written.
     """
@@ -67,7 +73,10 @@ def animate(
         raise ValueError(f"step_seconds must be a positive number, got {step_seconds}")
     arguments.integer(pause_steps, "pause_steps", 0, arguments.MOST_INT)
     changing = None if goals is None else goals_over_time(instance, solution, goals)
-    picture = _page(instance, title, _moving(instance, solution, changing, step_seconds, pause_steps))
+    if watched is not None:
+        arguments.integer(watched, "watched", 0, instance.num_agents - 1)
+    config = EnvConfig() if config is None else arguments.instance_of(config, EnvConfig, "config")
+    picture = _page(instance, title, _moving(instance, solution, changing, step_seconds, pause_steps, watched, config))
     if path is not None:
         write_whole(path, picture)
     return picture
@@ -102,7 +111,13 @@ def draw(instance: Instance, solution: Solution | None = None) -> str:
 
 
 def _moving(
-    instance: Instance, solution: Solution, changing: Cells | None, step_seconds: float, pause_steps: int
+    instance: Instance,
+    solution: Solution,
+    changing: Cells | None,
+    step_seconds: float,
+    pause_steps: int,
+    watched: int | None,
+    config: EnvConfig,
 ) -> list[str]:
     """All that changes with time: goals, trails, robots, and below the map a line of progress and two counters."""
     loop = np.pad(solution.paths, ((pause_steps, pause_steps), (0, 0), (0, 0)), mode="edge")
@@ -143,6 +158,7 @@ def _moving(
     return [
         *trails,
         *goals,
+        *([] if watched is None else _senses(instance, loop, watched, config, clock)),
         *robots,
         f'<rect {bar} width="{right - left}" fill="{_LINE}"/>',
         f'<rect {bar} width="0" fill="{_FAINT_INK}">{growth}</rect>',
@@ -152,6 +168,33 @@ def _moving(
         _counter(clock, [f"step {now} of {steps}" for now in step], instance, "end"),
         "</g>",
     ]
+
+
+def _senses(instance: Instance, loop: Cells, robot: int, config: EnvConfig, clock: svg.Clock) -> list[str]:
+    """The field of view that moves with a robot, and a line to each other robot while the robot hears it."""
+    radius, side = config.comm_radius, (2 * config.fov_radius + 1) * _CELL
+    if config.comm_range == "connected":
+        radius = rules.connecting_radius(instance.starts, radius)
+    x, y = (value - config.fov_radius * _CELL for value in _corner(loop[0, robot]))
+    shift = clock.smooth("transform", (loop[:, robot] - loop[0, robot])[:, ::-1] * _CELL, "animateTransform")
+    height, width = (cells * _CELL for cells in instance.grid.shape)
+    parts = [
+        f'<clipPath id="view-{width}-{height}"><rect width="{width}" height="{height}"/></clipPath>',
+        f'<g clip-path="url(#view-{width}-{height})"><rect class="view" x="{x}" y="{y}" width="{side}" height="{side}" '
+        f'fill="{_SEEN}" fill-opacity=".22" stroke="{_HEARD}">{shift}</rect></g>',
+    ]
+    hears = np.stack([rules.communication_graph(cells, radius)[robot] > 0 for cells in loop])
+    centres = loop * _CELL + _CELL / 2
+    for other in np.flatnonzero(hears.any(axis=0)):
+        ends = {"x1": (robot, 1), "y1": (robot, 0), "x2": (other, 1), "y2": (other, 0)}
+        where = " ".join(f'{name}="{centres[0, i, axis]:g}"' for name, (i, axis) in ends.items())
+        moves = "".join(clock.smooth(name, centres[:, i, axis, None]) for name, (i, axis) in ends.items())
+        shown = hears[:, other].astype(int).tolist()
+        parts.append(
+            f'<line class="link" {where} stroke="{_HEARD}" stroke-width="3" stroke-opacity="{shown[0]}">{moves}'
+            f"{clock.sudden('stroke-opacity', shown)}</line>"
+        )
+    return parts
 
 
 def _page(instance: Instance, title: str | None, parts: Iterable[str]) -> str:

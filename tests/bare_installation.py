@@ -1,5 +1,6 @@
 """A smoke test for an environment with nothing but `pip install mapf-env`; run as a script, outside the repository."""
 
+import subprocess
 import sys
 
 import numpy as np
@@ -31,4 +32,11 @@ except ImportError as missing:
     advice = str(missing)
 assert 'pip install "mapf-env[train]"' in advice, advice
 assert "torch" not in sys.modules
+
+command = [sys.executable, "-c", "import sys; from mapf_env.console import main; sys.exit(main())"]
+assert subprocess.run([*command, "--help"], check=False).returncode == 0
+refused = subprocess.run([*command, "play", "a.map"], capture_output=True, text=True, check=False)
+assert refused.returncode == 2, refused
+assert 'pip install "mapf-env[train]"' in refused.stderr
+assert refused.stderr.count("\n") == 1, refused.stderr
 print("bare installation: environment and experts run, torch is not there")

@@ -14,7 +14,7 @@ import pytest
 from mapf_env import HISTORY, random_instance
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "tutorials" / "add_observation_channel.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "howto" / "channel.md").read_text(encoding="utf-8")
 
 PROGRAM = r"""
 #include <cstring>

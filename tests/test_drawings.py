@@ -28,7 +28,9 @@ def test_a_failure_is_of_its_kind(name: str) -> None:
 
 
 def test_every_drawing_is_shown() -> None:
-    concepts = (HOME.parent / "concepts.md").read_text(encoding="utf-8")
+    pages = "".join(
+        (HOME.parent / name).read_text(encoding="utf-8") for name in ("how_it_works.md", "why_teams_fail.md")
+    )
     drawings = {path.name for path in HOME.glob("*.svg")}
     assert drawings
-    assert drawings == {name for name in drawings if f"](drawings/{name})" in concepts}
+    assert drawings == {name for name in drawings if f"](drawings/{name})" in pages}

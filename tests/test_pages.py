@@ -26,7 +26,7 @@ import experts
 import gnn_policy
 import mapf_env
 from experts import command as experts_command
-from gnn_policy import evaluate, play, train
+from gnn_policy import evaluate, play, report, train
 from mapf_env import random_instance, save_instances, save_map, save_scen
 
 ROOT = Path(__file__).parents[1]
@@ -36,6 +36,12 @@ PAGES = [
     for page in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
     if "frameworks" not in page.parts
 ]
+
+
+COMMANDS = {
+    "solve": ["python", "-m", "experts", "solve"],
+    **{name: ["python", "-m", f"gnn_policy.{name}"] for name in ("play", "train", "evaluate", "report")},
+}
 
 
 def blocks(page: str) -> list[tuple[str, str]]:
@@ -70,8 +76,10 @@ def carry_out(line: str) -> None:
         case ["python", "-m", "gnn_policy.train", *options]:
             if train.parse(options).config.rounds <= 2:
                 train.main([*options, "--threads", "1"])
-        case ["python", "benchmarks/report.py", *options]:
-            subprocess.run([sys.executable, str(ROOT / "benchmarks" / "report.py"), *options], check=True, timeout=120)
+        case ["python", "-m", "gnn_policy.report", *options]:
+            report.main(options)
+        case ["mapf-env", command, *options] if command in COMMANDS:
+            carry_out(shlex.join([*COMMANDS[command], *options]))
         case ["python", script, *_] if (ROOT / script).is_file():
             return
         case ["sphinx-build", "--fail-on-warning", source, _]:  # of the extra "docs"
@@ -108,7 +116,7 @@ def test_the_code_blocks_run_one_after_another(
     if page == "docs/environment.md":
         assert "ask for fewer agents or a lower density" in capsys.readouterr().out
     if page == "README.md":
-        assert (tmp_path / "expert.svg").read_text().startswith("<svg")
+        assert (tmp_path / "replay.html").read_text().startswith("<!doctype html>")
     if page == "docs/tutorials/own_map.md":
         assert {"depot.html", "depot.svg", "again.html", "expert.svg"} <= {each.name for each in tmp_path.iterdir()}
     if page == "docs/tutorials/train_and_evaluate.md":
@@ -126,7 +134,7 @@ def test_commands_in_the_text_name_scripts_and_options_that_exist(page: str) -> 
         script, *options = words[1:] if words[1] != "-m" else [words[2].replace(".", "/") + ".py", *words[3:]]
         if not (ROOT / script).is_file():
             script = f"{script.removesuffix('.py')}/command.py"
-        beside = [
+        neighbours = [
             (ROOT / script).with_name(f"{name}.py") for name in imported((ROOT / script).read_text(encoding="utf-8"))
         ]
         settings = (
@@ -136,7 +144,7 @@ def test_commands_in_the_text_name_scripts_and_options_that_exist(page: str) -> 
             "mapf_env/senses.py",
         )
         sources = [ROOT / script, *(ROOT / file for file in settings)]
-        sources += [each for each in beside if each.is_file()]
+        sources += [each for each in neighbours if each.is_file()]
         text = "".join(source.read_text(encoding="utf-8") for source in sources)
         for option in options:
             if option.startswith("--") and option != "--help":

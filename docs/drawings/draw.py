@@ -1,4 +1,4 @@
-"""The drawings of docs/concepts.md: `python docs/drawings/draw.py` writes them anew beside this file."""
+"""The drawings of the docs: `python docs/drawings/draw.py` writes them again next to this file."""
 
 from __future__ import annotations
 

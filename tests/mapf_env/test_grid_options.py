@@ -113,6 +113,8 @@ def test_rendering(capsys: pytest.CaptureFixture[str]) -> None:
     env = parallel_env(**size, render_mode="human")
     env.reset(options={"instance": instance})
     assert capsys.readouterr().out == "AB#\n.ba\n"
+    env.step({"agent_0": 4, "agent_1": 2})
+    assert capsys.readouterr().out == "\nA.#\n.*a\n"
     assert parallel_env(**size).render() is None
     with pytest.raises(ValueError, match="render_mode must be"):
         parallel_env(render_mode="hologram")  # pyright: ignore[reportArgumentType]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapf_env import Instance, Solution, animate, draw
+from mapf_env import EnvConfig, Instance, Solution, animate, draw
 
 CELL = 24
 NAMESPACE = "{http://www.w3.org/2000/svg}"
@@ -292,3 +292,26 @@ def test_solutions_of_another_instance(picture):
 def test_a_file_that_cannot_be_written(tmp_path):
     with pytest.raises(FileNotFoundError):
         animate(*one_robot([(0, 0)], goal=(0, 0)), tmp_path / "nowhere" / "a.svg")
+
+
+def test_a_watched_robot_shows_its_view_and_whom_it_hears():
+    """The lines that are visible at a time lead to the robots closer than the radius, and the view goes along."""
+    paths = np.array([[[2, 2], [2, 6], [9, 9]], [[2, 3], [2, 6], [9, 9]], [[2, 4], [2, 7], [9, 9]]])
+    instance = Instance(np.zeros((10, 10), bool), paths[0], paths[-1])
+    config = EnvConfig(fov_radius=2, comm_radius=4.0)
+    drawn = ElementTree.fromstring(
+        animate(instance, Solution(paths), watched=0, config=config, pause_steps=0, step_seconds=1.0)
+    )
+    (view,) = (each for each in drawn.iter(f"{NAMESPACE}rect") if each.get("class") == "view")
+    assert [float(view.get(name, "")) for name in ("x", "y", "width")] == [0, 0, 5 * 24]
+    (shift,) = view.iter(f"{NAMESPACE}animateTransform")
+    assert shift.get("values") == "0,0;48,0"
+    (line,) = (each for each in drawn.iter(f"{NAMESPACE}line") if each.get("class") == "link")
+    assert line.get("stroke-opacity") == "0", "at time 0 the robots are exactly 4 cells apart"
+    changes = {each.get("attributeName"): each for each in line.iter(f"{NAMESPACE}animate")}
+    assert changes["stroke-opacity"].get("values") == "0;1"
+    assert changes["stroke-opacity"].get("keyTimes") == "0;0.5"
+    assert changes["x1"].get("values") == "60;108"
+    assert changes["x2"].get("values") == "156;156;180"
+    with pytest.raises(ValueError, match="watched must be at most 2"):
+        animate(instance, Solution(paths), watched=3)

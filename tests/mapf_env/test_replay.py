@@ -80,6 +80,24 @@ said.push(left.right < right.left && left.top === right.top);
 document.body.dataset.said = JSON.stringify({said});
 }</script></body>"""
 
+KEYS = """
+<script>{
+const said = [], press = (key, target = document.body) => {
+  target.dispatchEvent(new KeyboardEvent("keydown", {key, bubbles: true, cancelable: true}));
+  said.push([state.time, state.playing, state.chosen]);
+};
+window.requestAnimationFrame = () => {};
+press("ArrowRight"); press("ArrowRight"); press("ArrowLeft");
+state.time = 1.4;
+press("ArrowLeft"); press("ArrowRight", slider);
+press(" "); press(" ");
+state.chosen = 0;
+press("Escape"); press("x");
+const box = state.panels[0].canvas.getBoundingClientRect();
+const fits = [box.right <= innerWidth, box.bottom <= innerHeight, Math.abs(box.width / box.height - 3) < 0.02];
+document.body.dataset.said = JSON.stringify({said, fits, wide: document.documentElement.scrollWidth <= innerWidth});
+}</script></body>"""
+
 
 def browse(page: str, script: str, folder: Path) -> dict[str, object]:
     path = folder / "page.html"
@@ -132,11 +150,31 @@ def test_scenes_are_chosen_and_their_solutions_share_a_clock(tmp_path: Path) -> 
         False,
         ["step 0 of 4, 0 of 1 on goal"],
         ["step 0 of 4, 0 of 1 on goal", "step 0 of 2, 0 of 1 on goal"],
-        ["step 4 of 4, 0 of 1 on goal", "step 2 of 2, 1 of 1 on goal"],
+        ["step 4 of 4, 0 of 1 on goal; not there (red rings): 0", "step 2 of 2, 1 of 1 on goal"],
         [True, False],  # who is late at the end wears a red ring
         ["policy", "expert"],
         True,
     ]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
+def test_keys_step_play_and_let_go_and_the_map_fits_its_canvas(tmp_path: Path) -> None:
+    alone = Instance(np.zeros((20, 60), bool), [[0, 0]], [[0, 3]])
+    drive = Solution(np.array([[[0, col]] for col in (0, 1, 2, 3)]))
+    told = browse(replay(alone, drive), KEYS, tmp_path)
+    assert told["said"] == [
+        [1, False, -1],
+        [2, False, -1],
+        [1, False, -1],
+        [1, False, -1],  # back from the middle of a step
+        [2, False, -1],
+        [2, True, -1],
+        [2, False, -1],
+        [2, False, -1],
+        [2, False, -1],  # other keys do nothing
+    ]
+    assert told["fits"] == [True, True, True]
+    assert told["wide"]
 
 
 def test_a_page_shows_something() -> None:

@@ -1,4 +1,4 @@
-"""One page about training runs: `python benchmarks/report.py RUNS...`.
+"""One page about training runs: `python -m gnn_policy.report RUNS...`.
 
 Learning curves, success and flowtime against the number of robots next to the paper's, failures with replays of
 examples, and tables of speed. The page is one file that works offline. Files that a run folder lacks are left out:
@@ -9,9 +9,9 @@ K`, which leaves `failures.html` next to it.
 from __future__ import annotations
 
 import csv
+import importlib.metadata
 import io
 import json
-import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -27,9 +27,8 @@ from matplotlib.figure import Figure
 from gnn_policy.command_line import run_command
 from gnn_policy.config import TrainConfig
 from gnn_policy.failures import MEANINGS
+from gnn_policy.paper_rates import PAPER, TEAMS
 from mapf_env.files import write_whole
-from paper_experiment import PAPER, TEAMS
-from paper_figures import heat_map
 
 STYLE = """
 body{margin:0;font:15px/1.5 system-ui,sans-serif;background:#f6f7f9;color:#1f2530}
@@ -121,16 +120,13 @@ def _tested_on(settings: dict[str, Any] | None) -> str:
 
 def page(runs: Sequence[Run], speed: dict[str, str]) -> str:
     """The report as HTML."""
-    here = Path(__file__).parent
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True, check=False
-    )
+    version = importlib.metadata.version("mapf-env")
     names = ", ".join(run.name for run in runs)
     parts = [
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
         f"<title>{escape(names)}</title><style>{STYLE}</style></head><body><main><h1>{escape(names)}</h1>"
-        f"<p>{date.today()}, commit {escape(commit.stdout.strip() or 'unknown')}</p>"
+        f"<p>{date.today()}, mapf-env {version}</p>"
     ]
     if any(run.metrics for run in runs):
         parts += ["<h2>Learning curves</h2>", curves([run for run in runs if run.metrics])]
@@ -174,6 +170,8 @@ def curves(runs: Sequence[Run]) -> str:
         xs = [int(each["samples"]) / 1e6 for each in known]
         success.plot(xs, [float(each["validation_success"]) for each in known], marker=".", label=run.name)
         loss.plot([int(each["samples"]) / 1e6 for each in run.metrics], [float(each["loss"]) for each in run.metrics])
+    for diagram in (success, loss):
+        diagram.locator_params(axis="x", nbins=5)
     success.set(xlabel="million robot states", ylabel="validation success, argmax")
     loss.set(xlabel="million robot states", ylabel="cross-entropy")
     legend(success)
@@ -208,6 +206,27 @@ def heat_maps(runs: Sequence[Run]) -> str:
         values = np.array([[row.get(size, np.nan) for size in columns] for row in table.values()])
         heat_map(pictures[-1], title, values, list(table), columns)
     return side_by_side(*pictures)
+
+
+def heat_map(
+    axes: Axes,
+    title: str,
+    values: np.ndarray,
+    rows: Sequence[object],
+    columns: Sequence[int],
+    *,
+    signed: bool = False,
+) -> None:
+    """Draw a cell for each pair of training and test teams, white where a number is missing; differences are signed."""
+    colours, low, high = ("PuOr_r", -0.5, 0.5) if signed else ("viridis", 0.3, 1.0)
+    axes.imshow(values, cmap=colours, vmin=low, vmax=high, aspect="auto")
+    for i, j in np.argwhere(np.isfinite(values)):
+        text = f"{values[i, j]:{'+' if signed else ''}.3f}".replace("0.", ".", 1)
+        dark = abs(values[i, j]) > 0.3 if signed else values[i, j] < 0.8
+        axes.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "black")
+    axes.set(title=title, xlabel="robots in test")
+    axes.set_xticks(range(len(columns)), list(map(str, columns)))
+    axes.set_yticks(range(len(rows)), list(map(str, rows)))
 
 
 def by_size(run: Run) -> tuple[int, str]:
@@ -261,7 +280,7 @@ def side_by_side(*diagrams: Axes) -> str:
 
 def parse(arguments: Sequence[str]) -> Options:
     """Return the command that the arguments ask for."""
-    return tyro.cli(Options, args=arguments, prog="python benchmarks/report.py", description=__doc__)
+    return tyro.cli(Options, args=arguments, prog="python -m gnn_policy.report", description=__doc__)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -11,8 +11,6 @@ import pytest
 
 from gnn_policy.config import TrainConfig
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "report.py"
-
 
 def estimate(mean: float) -> dict[str, float]:
     return {"mean": mean, "low": mean, "high": mean}
@@ -50,8 +48,8 @@ def run(tmp_path: Path) -> Path:
 
 
 def report(*arguments: object, folder: Path) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, str(SCRIPT), *map(str, arguments)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    command = [sys.executable, "-m", "gnn_policy.report", *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, check=False)
 
 
 def test_the_page_has_curves_tables_replays_and_speed(run: Path, tmp_path: Path) -> None:
