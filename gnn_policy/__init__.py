@@ -8,10 +8,14 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 # Found, not imported: the commands read their arguments before they load a library that takes seconds.
-if missing := [name for name in ("torch", "torchrl") if find_spec(name) is None]:
+_MISSING = [name for name in ("torch", "torchrl") if find_spec(name) is None]
+_ADVICE = (
+    'gnn_policy needs the extra "train" (there is no {missing}): '
+    'pip install "mapf-env[train]", or in a checkout pip install ".[train]"'
+)
+if _MISSING and find_spec("onnxruntime") is None:
     raise ImportError(
-        f'gnn_policy needs the extra "train" (there is no {missing[0]}): '
-        'pip install "mapf-env[train]", or in a checkout pip install ".[train]"'
+        _ADVICE.format(missing=_MISSING[0]) + '; to run exported policies on robots: pip install "mapf-env[robot]"'
     )
 
 # OpenMP's threads wait for each other by spinning, which multiplies the time of training as soon as another process
@@ -43,6 +47,7 @@ _MODULES = {
     "save": "checkpoint",
 }
 """Each public name and the module that defines it, which is imported when the name is first used."""
+_NEEDS_TORCH = frozenset(_MODULES) - {"Execution", "Message", "PolicyConfig", "Robot"}
 
 __all__ = [
     "Actor",
@@ -73,6 +78,8 @@ sys.modules[__name__].__class__ = _Package
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if _MISSING and name in _NEEDS_TORCH:
+        raise ImportError(_ADVICE.format(missing=_MISSING[0]))
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 

@@ -14,7 +14,6 @@ from torch import nn
 from gnn_policy.execution import Execution, alarmed
 from gnn_policy.policy_config import PolicyConfig
 from mapf_env import Action, Bag, Observation
-from mapf_env.senses import robot_features
 
 Scores = npt.NDArray[np.float32]
 
@@ -73,7 +72,7 @@ def scores_of(policy: nn.Module, bag: Bag, execution: Execution, noise: Any) -> 
         ValueError: If the bag does not say what the execution reads, such as which robots are stuck.
     """
     config: PolicyConfig = policy.config  # pyright: ignore[reportAssignmentType]
-    facts = facts_of(bag.scalars, config, execution)
+    facts = execution.facts(bag.scalars, config)
     alarm = np.zeros(len(bag.team), np.bool_)
     if "stuck" in facts:
         alarm = facts["stuck"][:, 0]
@@ -81,27 +80,6 @@ def scores_of(policy: nn.Module, bag: Bag, execution: Execution, noise: Any) -> 
             alarm = alarmed(alarm, bag.edge_index)
     jammed = facts["jammed"][:, 0] if "jammed" in facts else None
     return execution.scores(logits_of(policy, bag), alarm, noise, facts.get("greedy_moves"), jammed)
-
-
-def facts_of(
-    scalars: npt.NDArray[np.floating], config: PolicyConfig, execution: Execution
-) -> dict[str, npt.NDArray[np.bool_]]:
-    """Return the robot features (M, width) that the execution reads, by name.
-
-    Raises:
-        ValueError: If they are not among the scalars.
-    """
-    if not execution.features:
-        return {}
-    names, known = execution.robot_features(config), robot_features(config.memory)
-    ends = np.cumsum([known[name].width for name in names])
-    if ends[-1] > scalars.shape[1]:
-        raise ValueError(
-            f"the execution {execution.name} reads {' and '.join(execution.features)}, which the observation does not "
-            "say: make the environment with **policy.env_settings(), or pass execution=Execution()"
-        )
-    columns = dict(zip(names, np.split(scalars[:, : ends[-1]], ends[:-1], axis=1), strict=True))
-    return {name: columns[name] > 0 for name in execution.features}
 
 
 def act(policy: nn.Module, observation: Any, execution: Execution, rng: np.random.Generator) -> Any:

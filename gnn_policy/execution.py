@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from hashlib import blake2b
 from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from gnn_policy.policy_config import PolicyConfig
-from mapf_env import Action, Senses
+from mapf_env import Action, Instance, Senses
 from mapf_env.arguments import number
 from mapf_env.config import Shield
 from mapf_env.hashing import mix
-from mapf_env.senses import CommRange, CommWeights
+from mapf_env.senses import CommRange, CommWeights, robot_features
 
 Actions = Literal["argmax", "sampled", "stuck", "fallback"]
 Seeds = npt.NDArray[np.uint64]
@@ -118,6 +119,28 @@ class Execution:
         """Return the robot features of `policy`, then those that only the execution reads."""
         return (*policy.robot_features, *(each for each in self.features if each not in policy.robot_features))
 
+    def facts(self, scalars: npt.NDArray[np.floating], policy: PolicyConfig) -> dict[str, Flags]:
+        """Return the robot features (M, width) that this way of execution reads itself, by name.
+
+        Args:
+            scalars: (M, K) what robots know about themselves.
+            policy: Says which columns these are.
+
+        Raises:
+            ValueError: If they are not among the scalars.
+        """
+        if not self.features:
+            return {}
+        names, known = self.robot_features(policy), robot_features(policy.memory)
+        ends = np.cumsum([known[name].width for name in names])
+        if ends[-1] > scalars.shape[1]:
+            raise ValueError(
+                f"the execution {self.name} reads {' and '.join(self.features)}, which the observation does not "
+                "say: make the environment with **policy.env_settings(), or pass execution=Execution()"
+            )
+        columns = dict(zip(names, np.split(scalars[:, : ends[-1]], ends[:-1], axis=1), strict=True))
+        return {name: columns[name] > 0 for name in self.features}
+
     def senses(self, policy: PolicyConfig) -> Senses:
         """Return what robots of `policy` perceive under this execution."""
         perceived: dict[str, Any] = policy.senses() | {"robot_features": self.robot_features(policy)}
@@ -198,6 +221,23 @@ def alarmed(stuck: Flags, edge_index: npt.NDArray[np.int64]) -> Flags:
     sender, receiver = edge_index
     alarm[receiver[stuck[sender]]] = True
     return alarm
+
+
+def episode_seeds(instances: Sequence[Instance], seeds: Sequence[int]) -> Seeds:
+    """Return the seeds (C,) with which `rollout` resets its environments: a hash of each instance and its seed.
+
+    Raises:
+        ValueError: If a seed is out of range.
+    """
+    wrong = [seed for seed in seeds if not 0 <= seed < 2**64]
+    if wrong:
+        raise ValueError(f"seed must lie in 0..2**64 - 1, got {wrong[0]}")
+    prints = [
+        blake2b(repr(each.grid.shape).encode() + each.grid.tobytes() + each.starts.tobytes() + each.goals.tobytes())
+        for each in instances
+    ]
+    counters = np.array([int.from_bytes(each.digest()[:8], "little") for each in prints], np.uint64)
+    return mix(np.array(seeds, np.uint64), counters)
 
 
 def robot_seeds(seeds: Seeds, robots: npt.NDArray[np.integer]) -> Seeds:

@@ -16,6 +16,7 @@ from gnn_policy.execution import Execution
 from gnn_policy.layers import GRAPH_LAYERS, MessageLayer, exchange_in_parts
 from gnn_policy.plugins import import_by_name
 from gnn_policy.policy_config import PolicyConfig
+from gnn_policy.torch_parts import TorchParts
 from mapf_env import Action, Bag
 
 
@@ -120,19 +121,8 @@ class DecentralizedPolicy(nn.Module):
         Raises:
             ValueError: If views or scalars are not those that the policy was made for.
         """
-        config = self.config
-        expected = (config.num_channels, config.fov_side, config.fov_side)
-        if fov.shape[1:] != expected:
-            raise ValueError(
-                f"views are {tuple(fov.shape[1:])}, this policy reads {expected}: make the environment with "
-                f"fov_radius={config.fov_radius} and extra_channels={config.extra_channels}"
-            )
-        K = config.num_robot_features
-        if scalars.shape[-1] < K:
-            raise ValueError(
-                f"robots have {scalars.shape[-1]} scalars, this policy reads {K}: make the environment with "
-                f"robot_features={config.robot_features} and memory={config.memory}"
-            )
+        config, K = self.config, self.config.num_robot_features
+        config.require_perceived(fov.shape[1:], scalars.shape[-1])
         dtype = self.head.weight.dtype
         views = fov.to(dtype, memory_format=torch.channels_last)
         if fov.dtype == torch.uint8:
@@ -151,6 +141,14 @@ class DecentralizedPolicy(nn.Module):
     def env_settings(self) -> dict[str, Any]:
         """Return the settings of an environment in which robots perceive what the policy needs, under its shield."""
         return self.execution.env_settings(self.config)
+
+    def parts(self) -> TorchParts:
+        """Return what a `Robot` runs.
+
+        Raises:
+            ValueError: If the graph layer cannot be run on one robot, or a weight is not finite.
+        """
+        return TorchParts(self)
 
     def act(
         self,

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from gnn_policy.settings import check_types
 from mapf_env.arguments import MOST_INT, integer
@@ -44,6 +49,37 @@ class PolicyConfig(Senses):
                 raise ValueError(f"{name} must be one of {', '.join(parts)}, or 'module:Class', got {given!r}")
         for name, least in (("features", 1), ("taps", 1), ("fov_radius", 2)):
             integer(getattr(self, name), name, least, MOST_INT)
+
+    def require_perceived(self, view: Sequence[int], scalars: int) -> None:
+        """Compare what a robot perceives with what the policy reads.
+
+        Args:
+            view: The shape (C, S, S) of a view.
+            scalars: The number of robot features; those that the policy does not read come last.
+
+        Raises:
+            ValueError: If they do not fit.
+        """
+        expected = (self.num_channels, self.fov_side, self.fov_side)
+        if tuple(view) != expected:
+            raise ValueError(
+                f"views are {tuple(view)}, this policy reads {expected}: make the environment with "
+                f"fov_radius={self.fov_radius} and extra_channels={self.extra_channels}"
+            )
+        if scalars < self.num_robot_features:
+            raise ValueError(
+                f"robots have {scalars} scalars, this policy reads {self.num_robot_features}: make the environment "
+                f"with robot_features={self.robot_features} and memory={self.memory}"
+            )
+
+    def decoded(self, view: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+        """Return a view (C, S, S) of float or uint8 as float32."""
+        values = np.array(view, np.float32)
+        if view.dtype == np.uint8:
+            for channel, (unit, low) in enumerate(zip(self.channel_unit, self.channel_low, strict=True)):
+                if unit != 1 or low != 0:
+                    values[channel] = values[channel] / unit + low
+        return values
 
     @property
     def plugins(self) -> dict[str, str]:

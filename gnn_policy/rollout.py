@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from hashlib import blake2b
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,12 +12,11 @@ from torch import nn
 
 from gnn_policy.acting import scores_of
 from gnn_policy.cases import Task
-from gnn_policy.execution import Execution, episode_noise
+from gnn_policy.execution import Execution, episode_noise, episode_seeds
 from gnn_policy.finite import require_finite
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.policy_config import PolicyConfig
 from mapf_env import Action, BatchedEnv, Instance, Solution, arguments
-from mapf_env.hashing import mix
 
 _MOST_BYTES = 2**28
 """Limit on the memory for the distance tables of teams that are played at the same time."""
@@ -139,7 +137,7 @@ def rollout(
     limits = np.array(_one_for_each("max_steps", max_steps, len(instances)), np.int64)
     if (limits < 1).any():
         raise ValueError(f"max_steps must be at least 1, got {limits.min()}")
-    seeds = _seeds(instances, _one_for_each("seed", seed, len(instances)))
+    seeds = episode_seeds(instances, _one_for_each("seed", seed, len(instances)))
     actor = _actor(policy, execution)
     settings = {**actor.env_settings(), "task": task, "message_loss": message_loss}
     was_training = isinstance(policy, nn.Module) and policy.training
@@ -178,19 +176,6 @@ def _one_for_each(name: str, given: int | Sequence[int] | npt.NDArray[np.integer
     if len(values) not in (1, count):
         raise ValueError(f"{len(values)} values of {name} for {count} instances: give one, or one for each")
     return values * count if len(values) == 1 else values
-
-
-def _seeds(instances: Sequence[Instance], seeds: Sequence[int]) -> npt.NDArray[np.uint64]:
-    """Return a hash (C,) of each instance and its seed."""
-    wrong = [seed for seed in seeds if not 0 <= seed < 2**64]
-    if wrong:
-        raise ValueError(f"seed must lie in 0..2**64 - 1, got {wrong[0]}")
-    prints = [
-        blake2b(repr(each.grid.shape).encode() + each.grid.tobytes() + each.starts.tobytes() + each.goals.tobytes())
-        for each in instances
-    ]
-    counters = np.array([int.from_bytes(each.digest()[:8], "little") for each in prints], np.uint64)
-    return mix(np.array(seeds, np.uint64), counters)
 
 
 def _batches(instances: Sequence[Instance], batch_size: int, task: Task) -> Iterator[npt.NDArray[np.intp]]:

@@ -11,22 +11,36 @@ NAMES = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
 WITHOUT = """
 import sys
 
-sys.modules["{library}"] = None  # as if it were not installed
+for library in {libraries}:
+    sys.modules[library] = None  # as if it were not installed
 try:
-    import gnn_policy
+    {statement}
 except ImportError as refusal:
     print(refusal)
 """
 
 
+def run_without(libraries, statement):
+    program = WITHOUT.format(libraries=libraries, statement=statement)
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+
+
 @pytest.mark.parametrize("library", ["torch", "torchrl"])
 def test_without_the_extra_the_message_names_what_to_install(library):
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT.format(library=library)], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.count("\n") == 1
-    assert 'pip install "mapf-env[train]"' in done.stdout
-    assert library in done.stdout
+    for libraries, statement in (
+        ([library, "onnxruntime"], "import gnn_policy"),
+        ([library], "from gnn_policy import load"),
+    ):
+        printed = run_without(libraries, statement)
+        assert printed.count("\n") == 1
+        assert 'pip install "mapf-env[train]"' in printed
+        assert library in printed
+    assert 'pip install "mapf-env[robot]"' in run_without([library, "onnxruntime"], "import gnn_policy")
+
+
+def test_a_robot_needs_no_torch():
+    statement = "import gnn_policy; print(gnn_policy.Robot.__name__, gnn_policy.Message.__name__)"
+    assert run_without(["torch", "torchrl"], statement) == "Robot Message\n"
 
 
 def test_a_robot_that_runs_a_policy_needs_no_torchrl():

@@ -2,54 +2,18 @@
 
 from __future__ import annotations
 
-import struct
 from collections import deque
 from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
-from gnn_policy.acting import facts_of
 from gnn_policy.execution import Execution, gumbel
-from gnn_policy.finite import require_finite
-from gnn_policy.layers import Links, MessageLayer, State
-from gnn_policy.network import DecentralizedPolicy
+from gnn_policy.robot.message import Message
+from gnn_policy.robot.parts import Features, HasParts, Heard, State
+from mapf_env.files import PathLike
 from mapf_env.senses import HISTORY
-
-Features = npt.NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Message:
-    """The message that a robot sends to all its neighbours in one round."""
-
-    features: Features
-    """(G,) the message of the policy's graph layer."""
-    stuck: bool
-    """True if the robot is stuck: off its goal and back on a cell where it stood in one of its last 16 steps."""
-
-    def to_bytes(self) -> bytes:
-        """Return one byte, then the features as little-endian float32: 4 G + 1 bytes, 513 for the paper's G = 128."""
-        return struct.pack("<?", self.stuck) + self.features.astype("<f4").tobytes()
-
-    @staticmethod
-    def from_bytes(data: bytes) -> Message:
-        """Read what `to_bytes` wrote.
-
-        Raises:
-            ValueError: If the length is not that of a message, or a feature is not a finite number.
-        """
-        if len(data) % 4 != 1 or data[0] > 1:
-            raise ValueError(
-                f"{len(data)} bytes are not a message: a message has one byte, 0 or 1, and 4 for each feature"
-            )
-        features = np.frombuffer(data, "<f4", offset=1).astype(np.float32)
-        if not np.isfinite(features).all():
-            raise ValueError("a message with features that are not finite is damaged: leave it out as if it were lost")
-        return Message(features, bool(data[0]))
 
 
 class Robot:
@@ -63,7 +27,8 @@ class Robot:
     number of the round: the radio says who sent one, and delivers it in the round in which it was sent or not at all.
 
     Args:
-        policy: The policy; its weights are shared, and it is put into evaluation mode.
+        policy: The policy: a network, whose weights are shared and which is put into evaluation mode, or an exported
+            one (`Robot.load`).
         execution: The choice of actions, the policy's own if not given; shield and communication range belong to
             the environment and are ignored here.
         seed: Seed of its draws; robots of one team need different ones.
@@ -73,19 +38,32 @@ class Robot:
             out of range.
     """
 
-    def __init__(self, policy: DecentralizedPolicy, execution: Execution | None = None, seed: int = 0) -> None:
+    def __init__(self, policy: HasParts, execution: Execution | None = None, seed: int = 0) -> None:
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed must lie in 0..2**64 - 1, got {seed}")
-        if not isinstance(policy.graph_layer, MessageLayer):
-            raise ValueError(
-                f"the graph layer {policy.config.graph_layer!r} has no start, send, receive, combine and finish "
-                "(gnn_policy.layers.MessageLayer), so it cannot run on one robot: play the policy by rollout"
-            )
-        require_finite(policy.state_dict())
-        self._policy, self._layer = policy.eval(), policy.graph_layer
-        self._execution = policy.execution if execution is None else execution
+        self._parts = policy.parts()
+        self._config = self._parts.config
+        self._execution = self._parts.execution if execution is None else execution
         self._seed = np.array([seed], np.uint64)
         self.reset()
+
+    @staticmethod
+    def load(folder: PathLike, execution: Execution | None = None, seed: int = 0) -> Robot:
+        """Return a robot that runs a policy which `python -m gnn_policy.export` wrote; torch is not needed.
+
+        Args:
+            folder: The folder with the manifest.
+            execution: As for `Robot`.
+            seed: As for `Robot`.
+
+        Raises:
+            OSError: If a file is missing.
+            ValueError: If a file is damaged, or the seed is out of range.
+            ImportError: If onnxruntime is missing.
+        """
+        from gnn_policy.robot.exported import ExportedPolicy
+
+        return Robot(ExportedPolicy(folder), execution, seed)
 
     def reset(self) -> None:
         """Forget all steps: the next is the first one of another episode."""
@@ -95,6 +73,7 @@ class Robot:
         self._edge_attr: dict[Hashable, Features] = {}
         self._state: State = ()
         self._round = -1
+        self._message: Message | None = None
         self._stuck = self._alarmed = False
         self._greedy: npt.NDArray[np.bool_] | None = None
         self._jammed = np.zeros(1, np.bool_)
@@ -102,7 +81,7 @@ class Robot:
     @property
     def rounds(self) -> int:
         """The number of messages that it sends in a step."""
-        return self._layer.rounds
+        return self._parts.rounds
 
     @property
     def links(self) -> Mapping[Hashable, float]:
@@ -112,7 +91,7 @@ class Robot:
     def begin(
         self,
         view: npt.NDArray[Any],
-        links: Mapping[Hashable, float],
+        links: Mapping[Any, float],
         cell: Iterable[int],
         *,
         scalars: npt.ArrayLike = (),
@@ -135,25 +114,27 @@ class Robot:
         wrong = [name for name, weight in links.items() if not 0 < weight < np.inf]
         if wrong:
             raise ValueError(f"links must have positive weights, got {links[wrong[0]]} to {wrong[0]!r}")
-        columns = self._policy.config.num_edge_features
+        columns = self._config.num_edge_features
         facts = {name: np.asarray((edge_attr or {}).get(name, ()), np.float32) for name in links}
         for name, fact in facts.items():
             if fact.shape != (columns,) or not np.isfinite(fact).all():
                 raise ValueError(
-                    f"the policy reads {columns} finite edge features ({', '.join(self._policy.config.edge_features)}) "
+                    f"the policy reads {columns} finite edge features ({', '.join(self._config.edge_features)}) "
                     f"of each link, got {fact.tolist()} of {name!r}"
                 )
         own = np.asarray(scalars, np.float32)
         if own.ndim != 1 or not np.isfinite(own).all():
             raise ValueError(f"scalars must be a row of finite numbers, got {own.tolist()}")
+        self._config.require_perceived(view.shape, len(own))
         if self._execution.actions == "fallback":
-            self._greedy = facts_of(own[None], self._policy.config, self._execution)["greedy_moves"]
-        with torch.inference_mode():
-            extracted = self._policy.extract(self._tensor(view)[None], self._tensor(own)[None])
-            if not bool(torch.isfinite(extracted).all()):
-                raise ValueError("the features of the view are not finite: check the view and the policy's weights")
-            self._weights, self._edge_attr = dict(links), facts
-            self._state = self._layer.start(extracted, self._links(links))
+            self._greedy = self._execution.facts(own[None], self._config)["greedy_moves"]
+        self._weights, self._edge_attr = dict(links), facts
+        state = self._parts.encode(
+            self._config.decoded(view), own[: self._config.num_robot_features], self._heard(self._weights)
+        )
+        if not all(np.isfinite(part).all() for part in state):
+            raise ValueError("the features of the view are not finite: check the view and the policy's weights")
+        self._state, self._message = state, None
         self._time += 1
         self._round = 0
         place, centre = tuple(int(each) for each in cell), view.shape[-1] // 2
@@ -168,9 +149,9 @@ class Robot:
         """The message for its neighbours in this round."""
         if not 0 <= self._round < self.rounds:
             raise RuntimeError(f"there are {self.rounds} rounds in a step: begin() the next step or act()")
-        with torch.inference_mode():
-            sent = self._layer.send(self._state, self._round)[0].float().cpu().numpy()
-        return Message(sent, self._stuck)
+        if self._message is None:
+            self._message = Message(self._parts.send(self._state, self._round), self._stuck)
+        return self._message
 
     def hear(self, messages: Mapping[Any, Message]) -> None:
         """Take the messages of this round that came, by the names of the links.
@@ -192,9 +173,8 @@ class Robot:
             self._alarmed |= message.stuck and self._execution.actions == "stuck"
         names = [name for name in self._weights if name in messages]  # in the links' order, as the network sums them
         heard = np.array([messages[name].features for name in names], np.float32).reshape(len(names), *size)
-        with torch.inference_mode():
-            received = self._layer.receive(self._state, self._tensor(heard), self._links(names), self._round)
-            self._state = self._layer.combine(self._state, received, self._round)
+        self._state = self._parts.combine(self._state, heard, self._heard(names), self._round)
+        self._message = None
         self._round += 1
 
     def logits(self) -> Features:
@@ -206,8 +186,7 @@ class Robot:
         """
         if self._round != self.rounds:
             raise RuntimeError(f"it heard {max(self._round, 0)} of {self.rounds} rounds: begin() and hear() first")
-        with torch.inference_mode():
-            logits = self._policy.decide(self._layer.finish(self._state))[0].float().cpu().numpy()
+        logits = self._parts.decide(self._state)
         if not np.isfinite(logits).all():
             raise ValueError("the logits are not finite numbers: check the messages and the policy's weights")
         return logits
@@ -234,14 +213,8 @@ class Robot:
         """
         return int(self.scores().argmax())
 
-    def _links(self, names: Iterable[Hashable]) -> Links:
+    def _heard(self, names: Iterable[Hashable]) -> Heard:
         chosen = list(names)
         attr = np.array([self._edge_attr[name] for name in chosen], np.float32)
-        return Links(
-            torch.zeros(len(chosen), dtype=torch.int64, device=self._policy.head.weight.device),
-            self._tensor(np.array([self._weights[name] for name in chosen], np.float32)),
-            self._tensor(attr.reshape(len(chosen), self._policy.config.num_edge_features)),
-        )
-
-    def _tensor(self, array: npt.NDArray[Any]) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self._policy.head.weight.device)
+        weight = np.array([self._weights[name] for name in chosen], np.float32)
+        return Heard(weight, attr.reshape(len(chosen), self._config.num_edge_features))

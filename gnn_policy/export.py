@@ -1,0 +1,59 @@
+"""`python -m gnn_policy.export NAME --out FOLDER`: a policy as ONNX parts and a manifest, for robots without torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from gnn_policy.command_line import run_command
+from mapf_env.arguments import integer
+
+
+@dataclass(frozen=True)
+class Command:
+    """Export a policy for robots without torch, and compare what ONNX Runtime computes with torch."""
+
+    policy: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
+    """A run folder of training, a .safetensors file, or the name of a policy that comes with the package."""
+    out: Path
+    """The folder, made if missing; files of earlier exports in it are replaced."""
+    bags: int = 20
+    """How many random bags of robots are compared."""
+    seed: int = 0
+    """Random seed for the bags."""
+    plugins: tuple[str, ...] = ()
+    """Encoders and graph layers of your own, as "module:Class", that the policy's file may import."""
+    debug: bool = False
+    """Print the traceback of an error."""
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """The command that the arguments ask for."""
+    return tyro.cli(Command, args=arguments, prog="python -m gnn_policy.export")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    run_command(parse, _export, arguments)
+
+
+def _export(command: Command) -> None:
+    from gnn_policy import checkpoint
+    from gnn_policy.onnx_export import compare, export
+
+    integer(command.bags, "--bags", 1)
+    policy = checkpoint.load(command.policy, plugins=command.plugins)
+    manifest = export(policy, command.out)
+    worst = compare(policy, command.out, bags=command.bags, seed=command.seed)
+    print(
+        f"{command.out}: {len(manifest['parts'])} parts, {manifest['rounds']} rounds, messages of "
+        f"{manifest['message_bytes']['float32']} bytes; differs from torch by {worst:.1e} at most"
+    )
+
+
+if __name__ == "__main__":
+    main()
