@@ -98,7 +98,8 @@ def _onnx(module: nn.Module, given: tuple[Tensor, ...], inputs: list[str]) -> by
     shapes = tuple({0: count} if name in linked else {} for name in inputs)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter's own parts and names of axes
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        for library in ("torch.onnx", "onnxscript", "onnx_ir"):
+            logging.getLogger(library).setLevel(logging.ERROR)
         program = torch.onnx.export(
             module,
             given,

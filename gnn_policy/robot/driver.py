@@ -14,7 +14,7 @@ from gnn_policy.execution import Execution
 from gnn_policy.policy_config import PolicyConfig
 from mapf_env.senses import robot_features
 
-_HEADER = struct.Struct("<IQiiHH")
+_HEADER = struct.Struct("<IiiHH")
 _MOST_LINKS = 4096
 
 
@@ -24,8 +24,6 @@ class Sensed:
 
     step: int
     """The number of the step in the episode, the same for all robots."""
-    seed: int
-    """Seed of the robot's draws, the same in all steps of an episode."""
     cell: tuple[int, int]
     """Row and column of where it stands."""
     view: npt.NDArray[np.float32]
@@ -52,7 +50,7 @@ class Sensed:
             np.array(near, "<i4"),
             np.array([self.nearby[name] for name in near], "<i4"),
         )
-        head = _HEADER.pack(self.step, self.seed, *self.cell, len(ids), len(near))
+        head = _HEADER.pack(self.step, *self.cell, len(ids), len(near))
         return head + b"".join(part.tobytes() for part in parts)
 
     @staticmethod
@@ -64,7 +62,7 @@ class Sensed:
         """
         if len(data) < _HEADER.size:
             raise ValueError(f"{len(data)} bytes are not what a robot senses")
-        step, seed, row, col, links, near = _HEADER.unpack_from(data)
+        step, row, col, links, near = _HEADER.unpack_from(data)
         known = robot_features(policy.memory)
         C, S, D = policy.num_channels, policy.fov_side, policy.num_edge_features
         K = sum(known[name].width for name in execution.robot_features(policy))
@@ -80,7 +78,7 @@ class Sensed:
         view, scalars, ids, weights, attr, names, cells = arrays
         senders = ids.tolist()
         return Sensed(
-            *(step, seed, (row, col), view.reshape(C, S, S), scalars),
+            *(step, (row, col), view.reshape(C, S, S), scalars),
             dict(zip(senders, weights.tolist(), strict=True)),
             dict(zip(senders, attr.reshape(links, D), strict=True)),
             {name: (r, c) for name, (r, c) in zip(names.tolist(), cells.reshape(near, 2).tolist(), strict=True)},

@@ -37,6 +37,10 @@ class Content(IntEnum):
     """A move or scores, to the driver."""
     END = 7
     """The world has ended."""
+    WELCOME = 8
+    """A robot joins a world, and the world's answer."""
+    READY = 9
+    """A robot can take part from the next step on."""
 
 
 _KNOWN = frozenset(Content)

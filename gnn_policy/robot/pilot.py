@@ -81,6 +81,11 @@ class Pilot:
         self._open_round()
 
     @property
+    def shields_itself(self) -> bool:
+        """True if it moves only where the local shield allows it."""
+        return self.rounds > self.robot.rounds
+
+    @property
     def over(self) -> bool:
         """True if there is nothing left to say or to wait for in this step."""
         settled = self._reservation is not None and self._reservation.settled and self._told
@@ -140,7 +145,7 @@ class Pilot:
     def _decide(self) -> None:
         """Choose what it wants; with a local shield, begin to reserve."""
         self.scores = self.robot.scores()
-        if self.rounds == self.robot.rounds:
+        if not self.shields_itself:
             return
         sensed = self._begun()
         centre = sensed.view.shape[-1] // 2

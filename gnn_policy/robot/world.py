@@ -90,7 +90,7 @@ class World:
             senders = bag.edge_index[0][own].tolist()
             near = np.flatnonzero((far[i] <= SIGHT) & (np.arange(count) != i)).tolist()
             sensed[i] = Sensed(
-                *(self.step_number, int(self.seeds[i]), cells[i], views[i], bag.scalars[i]),
+                *(self.step_number, cells[i], views[i], bag.scalars[i]),
                 dict(zip(senders, bag.edge_weight[own].tolist(), strict=True)),
                 dict(zip(senders, bag.edge_attr[own], strict=True)),
                 {j: cells[j] for j in near},
