@@ -92,7 +92,8 @@ def radio(policy: ExportedPolicy, count: int) -> None:
 def bits(policy: ExportedPolicy, count: int) -> None:
     """The table of the numbers of messages."""
     print(
-        "| numbers | bytes of a message | success | flowtime a robot | bytes a robot sends a step |\n|---|---|---|---|---|"
+        "| numbers | bytes of a message | success | flowtime a robot | bytes a robot sends a step |\n"
+        "|---|---|---|---|---|"
     )
     precisions: tuple[Precision, ...] = ("float32", "float16", "int8")
     for precision in precisions:

@@ -29,7 +29,8 @@ def test_a_failure_is_of_its_kind(name: str) -> None:
 
 def test_every_drawing_is_shown() -> None:
     pages = "".join(
-        (HOME.parent / name).read_text(encoding="utf-8") for name in ("how_it_works.md", "why_teams_fail.md")
+        (HOME.parent / name).read_text(encoding="utf-8")
+        for name in ("how_it_works.md", "why_teams_fail.md", "real_robots.md")
     )
     drawings = {path.name for path in HOME.glob("*.svg")}
     assert drawings

@@ -34,6 +34,7 @@ def drawings() -> dict[str, str]:
         "vertex_conflict": animate(*walked("bA.Ba", "R", "L", steps=1), title="Vertex conflict"),
         "swap_conflict": animate(*walked("bAB.a", "R", "L", steps=1), title="Swap conflict"),
         "shield": animate(*walked("..B..\n.....\nA...a\n..b..", "RRRR", "DIDD", steps=4), title="One goes, one waits"),
+        "robots": robots(),
         **{name: animate(*failed, title=name.capitalize().replace("_", " ")) for name, failed in failures().items()},
     }
 
@@ -69,6 +70,40 @@ def view(instance: Instance, robot: int, radius: int) -> str:
     x, y, to_x, to_y = ((each + 0.5) * CELL for each in (col, row, goal_col, goal_row))
     line = f'<path d="M{x} {y}L{to_x} {to_y}" stroke="#d08700" stroke-width="2" stroke-dasharray="5 4"/>'
     return under_the_robots(draw(instance), window + line)
+
+
+def robots() -> str:
+    """Two robots as processes: what is in each, and what goes between them."""
+    boxes = [
+        (40, 20, "Robot", "the policy's parts, ONNX or torch"),
+        (40, 80, "Pilot and Reservation", "rounds, local shield"),
+        (40, 140, "Radio", "zenoh"),
+        (40, 220, "Driver", "sensors and motors, or a simulated world"),
+    ]
+    parts = []
+    for left, name in ((0, "agent_3"), (400, "agent_7")):
+        parts.append(
+            f'<rect x="{left + 20}" y="6" width="300" height="188" rx="6" fill="#ffc400" fill-opacity=".12" '
+            f'stroke="#d08700"/><text x="{left + 310}" y="188" text-anchor="end" font-size="11">process {name}</text>'
+        )
+        for x, y, title, note in boxes:
+            parts.append(
+                f'<rect x="{left + x}" y="{y}" width="260" height="40" rx="4" fill="#fff" stroke="#555"/>'
+                f'<text x="{left + x + 130}" y="{y + 17}" text-anchor="middle" font-weight="bold">{title}</text>'
+                f'<text x="{left + x + 130}" y="{y + 33}" text-anchor="middle" font-size="11">{note}</text>'
+            )
+        for y, z in ((60, 80), (120, 140), (180, 220)):
+            parts.append(f'<path d="M{left + 170} {y}V{z}" stroke="#555" stroke-width="2"/>')
+        parts.append(f'<text x="{left + 180}" y="212" font-size="11">sensed, accepted moves</text>')
+    parts.append(
+        '<path d="M300 160H440" stroke="#d08700" stroke-width="3" stroke-dasharray="6 4"/>'
+        '<text x="370" y="140" text-anchor="middle" font-size="11">K - 1 rounds</text>'
+        '<text x="370" y="153" text-anchor="middle" font-size="11">+ reservations</text>'
+    )
+    return (
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 740 270" width="740" height="270" '
+        f'font-family="sans-serif" font-size="13"><rect width="740" height="270" fill="#fff"/>{"".join(parts)}</svg>\n'
+    )
 
 
 def graph(instance: Instance, radius: float) -> str:
