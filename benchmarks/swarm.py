@@ -37,7 +37,7 @@ def cases(count: int, robots: int = ROBOTS) -> list[Instance]:
 
 
 def outcome(played: Rehearsal, instance: Instance, without: int | None = None) -> tuple[bool, int]:
-    """Success and flowtime of the robots, but for one that may be left out; who is not on its goal counts T_max."""
+    """Return success and flowtime, if wanted without one robot; a robot that is not on its goal counts T_max."""
     robots = [robot for robot in range(instance.num_agents) if robot != without]
     at_end = (played.solution.paths[-1] == instance.goals).all(axis=1)[robots]
     times = np.where(at_end, played.solution.arrivals[robots], MAX_STEPS)

@@ -7,18 +7,17 @@ import inspect
 import os
 import sys
 import textwrap
-import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
+
+from gnn_policy.cli_errors import DEBUG, cli_errors
 
 if TYPE_CHECKING:
     from gnn_policy.network import DecentralizedPolicy
 
 C = TypeVar("C")
-DEBUG = "--debug"
 
 
 def run_command(
@@ -76,39 +75,6 @@ def _flow_help(kind: type) -> None:
         for inner in get_type_hints(each).values():
             if is_dataclass(inner):
                 _flow_help(cast(type, inner))
-
-
-@contextmanager
-def cli_errors(*, debug: bool = False) -> Iterator[None]:
-    """Report any error in one line on stderr with exit status 2, and Ctrl-C with status 130.
-
-    Args:
-        debug: Print the traceback of an error first.
-    """
-    try:
-        yield
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        raise SystemExit(130) from None
-    except Exception as error:
-        if debug:
-            traceback.print_exc()
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        raise SystemExit(2) from None
-
-
-def _one_line(error: Exception) -> str:
-    """The message of an error; where the user's input may not be the cause, with its type and how to see more."""
-    text = " ".join(str(error).split())
-    if isinstance(error, ValueError | TypeError | OSError) and text:
-        return text
-    if isinstance(error, MemoryError):
-        text = f"not enough memory ({text or 'MemoryError'}): ask for fewer or smaller maps, teams or batches"
-    elif isinstance(error, RecursionError):
-        text = f"too deeply nested ({text})"
-    else:
-        text = f"{type(error).__name__}: {text}" if text else type(error).__name__
-    return f"{text} ({DEBUG} shows the traceback)"
 
 
 def on_device(policy: DecentralizedPolicy, device: str) -> DecentralizedPolicy:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from gnn_policy.command_line import run_command
+from gnn_policy.command_line import parse_options, run_command
 from mapf_env.arguments import integer
 
 
@@ -22,7 +22,7 @@ class Command:
     out: Path
     """The folder, made if missing; files of earlier exports in it are replaced."""
     bags: int = 20
-    """How many random bags of robots are compared."""
+    """Number of random bags of robots that are compared."""
     seed: int = 0
     """Random seed for the bags."""
     plugins: tuple[str, ...] = ()
@@ -33,12 +33,12 @@ class Command:
 
 def parse(arguments: Sequence[str]) -> Command:
     """The command that the arguments ask for."""
-    return tyro.cli(Command, args=arguments, prog="python -m gnn_policy.export")
+    return parse_options(Command, arguments, prog="python -m gnn_policy.export")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command."""
-    run_command(parse, _export, arguments)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    return run_command(parse, _export, arguments)
 
 
 def _export(command: Command) -> None:
@@ -56,4 +56,4 @@ def _export(command: Command) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

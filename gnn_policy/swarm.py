@@ -16,7 +16,7 @@ from typing import get_args
 
 import numpy as np
 
-from gnn_policy.command_line import cli_errors
+from gnn_policy.cli_errors import DEBUG, cli_errors
 from gnn_policy.robot.__main__ import KEY_VARIABLE
 from gnn_policy.robot.message import Precision
 from gnn_policy.robot.world import ShieldedBy, World
@@ -72,7 +72,7 @@ class Swarm:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
     given = sys.argv[1:] if arguments is None else arguments
-    with cli_errors(debug="--debug" in given):
+    with cli_errors(debug=DEBUG in given):
         _play(_parser().parse_args(given))
 
 
@@ -155,7 +155,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a map (.map), a scenario (.scen), a set of instances")
     parser.add_argument("--agents", type=int, help="how many robots: at random on a map, else the first of the file")
-    parser.add_argument("--map", type=Path, help="the map of a scenario, if it does not lie beside it")
+    parser.add_argument("--map", type=Path, help="the map of a scenario, if it is not in the same folder")
     parser.add_argument("--index", type=int, help="which instance of a file, from 0")
     parser.add_argument(
         *("--policy",),

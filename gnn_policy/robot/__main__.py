@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from typing import get_args
 
-from gnn_policy.command_line import cli_errors
+from gnn_policy.cli_errors import DEBUG, cli_errors
 from gnn_policy.robot.driver import Driver, EndOfWorld
 from gnn_policy.robot.message import Precision
 from gnn_policy.robot.pilot import RESERVATION_ROUNDS, Pilot
@@ -23,7 +23,7 @@ KEY_VARIABLE = "MAPF_TEAM_KEY"
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
     given = sys.argv[1:] if arguments is None else arguments
-    with cli_errors(debug="--debug" in given):
+    with cli_errors(debug=DEBUG in given):
         _work(_parser().parse_args(given))
 
 

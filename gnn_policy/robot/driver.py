@@ -1,4 +1,4 @@
-"""What a robot's driver provides: what is perceived at the start of each step, and a body that carries out moves."""
+"""A robot's driver: it perceives at the start of each step, and carries out moves."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOST_LINKS = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensed:
-    """What one robot perceives at the start of a step."""
+    """The perception of one robot at the start of a step."""
 
     step: int
     """The number of the step in the episode, the same for all robots."""

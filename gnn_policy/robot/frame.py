@@ -1,4 +1,4 @@
-"""What goes over the radio: a header of 40 bytes and a body; everything that is not exactly that is dropped.
+"""Frames that go over the radio: a header of 40 bytes and a body; anything else is dropped.
 
 A header is the version, what the body is, the round, the sender, the step, the episode, the length of the body and a
 tag of 16 bytes, keyed BLAKE2b over everything else. Without a key the tag is a checksum, which finds damage. With a key
@@ -23,7 +23,7 @@ HEADER_BYTES = _HEADER.size + _TAG
 
 
 class Content(IntEnum):
-    """What the body of a frame is."""
+    """The kind of a frame's body."""
 
     FLOAT32 = 1
     """A message of the policy, its features as float32; the next two likewise."""
@@ -32,7 +32,7 @@ class Content(IntEnum):
     RESERVATION = 4
     """A message of the local shield (`gnn_policy.robot.reservation`)."""
     SENSED = 5
-    """What the driver tells a robot at the start of a step (`gnn_policy.robot.driver`)."""
+    """The perception of a robot at the start of a step (`gnn_policy.robot.driver`)."""
     COMMAND = 6
     """A move or scores, to the driver."""
     END = 7

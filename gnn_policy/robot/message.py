@@ -1,4 +1,4 @@
-"""What robots tell each other in a round of the policy, and how it is put into bytes."""
+"""The message of a robot in a round of the policy, and its bytes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LARGEST_FLOAT16 = 65504.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Message:
-    """What a robot sends to all its neighbours in one round."""
+    """The message that a robot sends to all its neighbours in one round."""
 
     features: npt.NDArray[np.float32]
     """(G,) the message of the policy's graph layer."""

@@ -1,4 +1,4 @@
-"""What a robot needs of a policy: four parts over NumPy arrays, whichever library computes them."""
+"""The parts of a policy that a robot needs: four functions over NumPy arrays, whichever library computes them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gnn_policy.policy_config import PolicyConfig
 
 Features = npt.NDArray[np.float32]
 State = tuple[npt.NDArray[Any], ...]
-"""What a robot keeps between rounds: arrays (1, ...), as many as the policy's graph layer wants."""
+"""The memory of a robot between rounds: arrays (1, ...), as many as the policy's graph layer wants."""
 
 
 class Heard(NamedTuple):
@@ -30,9 +30,9 @@ class Parts(Protocol):
     config: PolicyConfig
     """The network and what its robots perceive."""
     execution: Execution
-    """How moves are chosen unless a caller says otherwise."""
+    """The choice of actions unless a caller says otherwise."""
     rounds: int
-    """How many messages a robot sends in a step."""
+    """Number of messages that a robot sends in a step."""
 
     def encode(self, view: Features, scalars: Features, links: Heard) -> State:
         """Return the first state from a view (C, S, S), robot features (K,) and all links of the step."""

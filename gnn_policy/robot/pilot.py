@@ -56,7 +56,7 @@ class Pilot:
         self.precision: Precision = precision
         self.rounds = robot.rounds + reservation_rounds
         self.dropped: Counter[str] = Counter()
-        """How many frames were dropped: damaged, foreign, late, repeated."""
+        """Number of dropped frames by reason: damaged, foreign, late, repeated."""
         self.scores = np.zeros(len(Action), np.float32)
         """(5,) the scores of the moves, once the policy's rounds are over."""
         self._content = next(content for content, name in PRECISIONS.items() if name == precision)

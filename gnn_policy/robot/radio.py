@@ -1,4 +1,4 @@
-"""How robots reach each other: the interface, and one in memory that loses, delays, repeats and forges frames."""
+"""Radios of robots: the interface, and one in memory that loses, delays, repeats and forges frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Radio(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Faults:
-    """What a radio in memory does to frames.
+    """The faults of a radio in memory.
 
     Raises:
         ValueError: If a probability is not in 0..1, or the delay is negative.

@@ -19,7 +19,7 @@ from mapf_env import Instance, Solution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rehearsal:
-    """How a swarm did."""
+    """The outcome of a swarm."""
 
     solution: Solution
     """The executed paths."""

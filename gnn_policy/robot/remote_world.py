@@ -161,7 +161,7 @@ class WorldServer:
     ) -> None:
         self.world = world
         self.seconds: list[float] = []
-        """How long each step took."""
+        """Duration of each step."""
         self._session, self._step_seconds = session, step_seconds
         self._fingerprint = bytes.fromhex(fingerprint)
         self._door, self._seal = Seal(key, 0), Seal(key, secrets.randbits(63) + 1)

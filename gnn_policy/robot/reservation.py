@@ -8,7 +8,7 @@ so.
 Before robot i commits to a move from its cell p into a cell c, all of this must hold:
 
 1. *Nobody stands there to stay.* If robot j stands on c, i has heard that j has committed to a move, not onto p.
-2. *Nobody else comes.* For each other robot k that stands beside c: i precedes k in this step, or i has heard from k
+2. *Nobody else comes.* For each other robot k that stands next to c: i precedes k in this step, or i has heard from k
    a set without the move onto c. Who precedes is the order of a hash of episode, step and number: all know it without a
    message, and it changes with each step, so that everybody's turn comes.
 
@@ -16,7 +16,7 @@ Why no step collides, whatever messages are lost, late or repeated:
 
 - A set that was heard is true for the rest of the step, whenever and how often it comes, since sets only shrink; a
   message that is lost leaves a robot with a larger set in mind than the true one. So less is allowed, never more.
-- *Two robots enter c.* Both stand beside c, so they are within two cells and see each other. Let i precede k. Then k
+- *Two robots enter c.* Both stand next to c, so they are within two cells and see each other. Let i precede k. Then k
   has heard from i a set without the move onto c. Sets never grow, so i does not commit to c: not both enter.
 - *One enters c, where j stays.* By rule 1 the one that enters has heard that j's driver had accepted a move away from
   c.
@@ -25,7 +25,7 @@ Why no step collides, whatever messages are lost, late or repeated:
 What this assumes, and a driver must provide:
 
 - A robot sees which robots stand within two cells of it, and which numbers they have. One whose number it cannot tell
-  gets a negative number: it precedes everybody and is never heard, so that nobody enters its cell or one beside it.
+  gets a negative number: it precedes everybody and is never heard, so that nobody enters its cell or one next to it.
 - The driver carries out a move that it has accepted in this step, even if the robot's process ends at once, and refuses
   a move that comes after the end of the step. A robot without an accepted move stays on its cell. Where the driver's
   answer is lost, the robot says nothing more in this step, so that others go on with what they heard before.
@@ -67,7 +67,7 @@ _ALL = (1 << Action.IDLE) - 1
 
 @dataclass(slots=True)
 class _Neighbour:
-    """What is known of a robot within two cells."""
+    """Knowledge of a robot within two cells."""
 
     cell: Cell
     moves: int = _ALL

@@ -41,7 +41,7 @@ def open_session(listen: str, connect: Sequence[str] = ()) -> zenoh.Session:
 
 
 class Inbox:
-    """What came on one key, in order; what finds no room is lost, as on any radio."""
+    """Bytes that came on one key, in order; those that find no room are lost, as on any radio."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self._waiting: queue.Queue[bytes] = queue.Queue(_MOST_WAITING)
