@@ -227,7 +227,7 @@ def main(options: Options) -> None:
     """Measure what is missing, and show and draw all there is."""
     rows = read(options.table)
     known = {(row.kind, row.robots) for row in rows}
-    wanted = [
+    wanted: list[tuple[Kind, int]] = [
         (kind, robots)
         for robots in options.robots
         for kind in options.kinds

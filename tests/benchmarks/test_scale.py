@@ -9,7 +9,7 @@ import scale
 
 def test_measurements_are_kept_in_order_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     table, figure = tmp_path / "scale.csv", tmp_path / "scale.png"
-    rows = [scale.measure(kind, robots, 1, 0) for kind, robots in (("pibt", 60), ("environment", 200))]
+    rows = [scale.measure("pibt", 60, 1, 0), scale.measure("environment", 200, 1, 0)]
     scale.write(table, rows)
     assert scale.read(table) == rows[::-1]
     assert [(row.robots, row.height, row.width) for row in rows] == [(60, 25, 25), (200, 46, 46)]
