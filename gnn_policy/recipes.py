@@ -84,7 +84,7 @@ _GENERAL = TrainConfig(
     kept_states=200_000,
     rollout_teams=64,
     rollout_length=128,
-    execution=Execution(actions="fallback", temperature=0.5, shield="pibt_swap"),
+    execution=Execution(actions="fallback", temperature=1.5, shield="pibt_swap"),
     rollout_actions="fallback",
     augment=True,
     optimizer="adamw",
