@@ -40,7 +40,7 @@ MARKERS = dict(zip(KINDS, "osD^", strict=True))
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure."""
+    """The settings of the measurements."""
 
     robots: tuple[int, ...] = (100, 1_000, 10_000, 100_000, 1_000_000)
     """Team sizes."""
@@ -54,7 +54,7 @@ class Options:
     seed: int = 0
     """Seed of maps, teams and actions."""
     table: Path = DOCS / "scale.csv"
-    """Where the measurements are kept; those that are there are not repeated."""
+    """The file of the measurements; those that are there are not repeated."""
     figure: Path = DOCS / "scale.png"
     """The plot."""
 

@@ -132,8 +132,8 @@ def test_commands_in_the_text_name_scripts_and_options_that_exist(page: str) -> 
     for line in COMMAND.findall((ROOT / page).read_text(encoding="utf-8")):
         words = shlex.split(line)
         script, *options = words[1:] if words[1] != "-m" else [words[2].replace(".", "/") + ".py", *words[3:]]
-        if not (ROOT / script).is_file():
-            script = f"{script.removesuffix('.py')}/command.py"
+        package = script.removesuffix(".py")
+        script = next(s for s in (script, f"{package}/command.py", f"{package}/__main__.py") if (ROOT / s).is_file())
         neighbours = [
             (ROOT / script).with_name(f"{name}.py") for name in imported((ROOT / script).read_text(encoding="utf-8"))
         ]
