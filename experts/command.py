@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from experts import arguments
@@ -28,7 +28,22 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments_given: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    options = _parser().parse_args(arguments_given)
+    parser = _Parser(prog="python -m experts", description=__doc__, epilog=_EXIT_CODES)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+    _define_solve(commands.add_parser("solve", help="solve an instance"))
+    _define_check(commands.add_parser("check", help="check a file of paths"))
+    return _run(parser, arguments_given)
+
+
+def solve(arguments_given: Sequence[str] | None = None, *, prog: str) -> int:
+    """Run the part "solve" under another name and return its exit status."""
+    parser = _Parser(prog=prog)
+    _define_solve(parser)
+    return _run(parser, arguments_given)
+
+
+def _run(parser: _Parser, arguments_given: Sequence[str] | None) -> int:
+    options = parser.parse_args(arguments_given)
     try:
         status = options.run(options)
         sys.stdout.flush()
@@ -39,16 +54,11 @@ def main(arguments_given: Sequence[str] | None = None) -> int:
     except Exception as error:
         if options.debug:
             traceback.print_exc()
-        print(f"python -m experts: {_in_one_line(error)}", file=sys.stderr)
+        print(f"{options.prog}: {_in_one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("python -m experts: interrupted", file=sys.stderr)
+        print(f"{options.prog}: interrupted", file=sys.stderr)
         return 130
-
-
-def solve(arguments_given: Sequence[str] | None = None) -> int:
-    """Run the part "solve" of the command; returns its exit status."""
-    return main(["solve", *(sys.argv[1:] if arguments_given is None else arguments_given)])
 
 
 def _in_one_line(error: Exception) -> str:
@@ -61,17 +71,11 @@ def _in_one_line(error: Exception) -> str:
     return f"{kind}: {text} ({advice})" if text else f"{kind} ({advice})"
 
 
-def _parser() -> _Parser:
-    parser = _Parser(prog="python -m experts", description=__doc__, epilog=_EXIT_CODES)
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
-
-    solve = commands.add_parser(
-        "solve",
-        help="solve an instance",
-        description="Solve the first robots of a MovingAI scenario or of an instance of a set, or robots placed at "
-        "random on a map, and print cost, bound and time. At a limit, ecbs gives the cheapest plan it has found and "
-        "says that it is not proved.",
-        epilog=_EXIT_CODES,
+def _define_solve(solve: _Parser) -> None:
+    solve.description = (
+        "Solve the first robots of a MovingAI scenario or of an instance of a set, or robots placed at random on a "
+        "map, and print cost, bound and time. At a limit, ecbs gives the cheapest plan it has found and says that it "
+        "is not proved."
     )
     _add_problem(solve, "problem")
     solve.add_argument("--solver", choices=SOLVER_NAMES, default="ecbs", help="default: ecbs")
@@ -97,21 +101,23 @@ def _parser() -> _Parser:
     )
     solve.add_argument("--paths", metavar="OUT", help="write the paths to this file, a line for each robot")
     solve.add_argument("--animation", metavar="OUT.svg", help="write an animation of the plan to this file")
-    solve.set_defaults(run=_solve)
+    _define_end(solve, _solve)
 
-    check = commands.add_parser(
-        "check",
-        help="check a file of paths",
-        description="Check that the paths of a file solve an instance: all begin at their starts, end on their goals, "
-        "move a cell at a time over free cells, and no two robots meet or swap.",
-        epilog=_EXIT_CODES,
+
+def _define_check(check: _Parser) -> None:
+    check.description = (
+        "Check that the paths of a file solve an instance: all begin at their starts, end on their goals, move a cell "
+        "at a time over free cells, and no two robots meet or swap."
     )
     check.add_argument("paths", metavar="PATHS", help="the file of paths, as `solve --paths` writes it")
     _add_problem(check, "--scen")
-    check.set_defaults(run=_check)
-    for command in (solve, check):
-        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    return parser
+    _define_end(check, _check)
+
+
+def _define_end(parser: _Parser, run: Callable[[argparse.Namespace], int]) -> None:
+    parser.epilog = _EXIT_CODES
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    parser.set_defaults(run=run, prog=parser.prog)
 
 
 def _add_problem(parser: argparse.ArgumentParser, name: str) -> None:

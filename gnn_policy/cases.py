@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from gnn_policy.settings import check_types
 from mapf_env import Instance, Maze, Rooms, Walls, Warehouse, random_cases, random_maps
+from mapf_env.arguments import lists_settings
 from mapf_env.generation import MapStyle, Style
 from mapf_env.hashing import mix
 from mapf_env.problem_file import load_problems
@@ -27,6 +28,7 @@ Range = tuple[int, int]
 Span = tuple[float, float]
 
 
+@lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
     """Random cases of one kind. A range (least, most) is drawn from uniformly, for each map or, for robots, each case.

@@ -14,7 +14,7 @@ from gnn_policy.cases import Cases, Family, Split, Task, cases_of_files, make_ca
 from gnn_policy.execution import Actions, Execution
 from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.settings import check_types
-from mapf_env.arguments import share
+from mapf_env.arguments import known_settings, lists_settings, share
 from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
@@ -25,6 +25,7 @@ Precision = Literal["auto", "float32", "bfloat16"]
 Optimizer = Literal["adam", "adamw"]
 
 
+@lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainConfig:
     """The settings of a training run; as written here they are those of the paper's setup section."""
@@ -332,8 +333,8 @@ def _settings(found: Any, kind: type, ignore_unknown: bool) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise TypeError(f"expected a table of settings, got {type(found).__name__}")
     known = {each.name for each in fields(kind)}
-    if not ignore_unknown and (strange := found.keys() - known):
-        raise ValueError(f"there is no setting {min(strange)!r}: the settings are {', '.join(sorted(known))}")
+    if not ignore_unknown:
+        known_settings(found, known)
     return {name: tuple(value) if isinstance(value, list) else value for name, value in found.items() if name in known}
 
 

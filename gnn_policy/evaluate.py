@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +18,8 @@ from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
 from gnn_policy.results_file import default_executions, refuse_other_settings, settings_of
 from mapf_env.generation import MapStyle
+
+PROG = "python -m gnn_policy.evaluate"
 
 
 @dataclass(frozen=True)
@@ -85,14 +88,14 @@ class Command:
     """Print the traceback of an error."""
 
 
-def parse(arguments: Sequence[str]) -> Command:
+def parse(arguments: Sequence[str], prog: str = PROG) -> Command:
     """Return the command that the arguments ask for."""
-    return parse_options(Command, arguments, prog="python -m gnn_policy.evaluate")
+    return parse_options(Command, arguments, prog=prog)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None, *, prog: str = PROG) -> None:
     """Run the command."""
-    run_command(parse, _evaluate, arguments)
+    run_command(partial(parse, prog=prog), _evaluate, arguments)
 
 
 def _evaluate(command: Command) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from gnn_policy.policy_config import PolicyConfig
 from mapf_env import Action, Instance, Senses
-from mapf_env.arguments import number
+from mapf_env.arguments import lists_settings, number
 from mapf_env.config import Shield
 from mapf_env.hashing import mix
 from mapf_env.senses import CommRange, CommWeights, robot_features
@@ -25,6 +25,7 @@ Logits = npt.NDArray[np.float32]
 _MOVES = np.uint64(2**32)  # what the draws are used for; the native core's uses are small numbers
 
 
+@lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Execution:
     """An execution of a policy; the defaults are the paper's.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,8 @@ import tyro
 
 from gnn_policy.command_line import parse_options, run_command
 from mapf_env.arguments import integer
+
+PROG = "python -m gnn_policy.export"
 
 
 @dataclass(frozen=True)
@@ -31,14 +34,14 @@ class Command:
     """Print the traceback of an error."""
 
 
-def parse(arguments: Sequence[str]) -> Command:
+def parse(arguments: Sequence[str], prog: str = PROG) -> Command:
     """The command that the arguments ask for."""
-    return parse_options(Command, arguments, prog="python -m gnn_policy.export")
+    return parse_options(Command, arguments, prog=prog)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, *, prog: str = PROG) -> int:
     """Run the command and return its exit status."""
-    return run_command(parse, _export, arguments)
+    return run_command(partial(parse, prog=prog), _export, arguments)
 
 
 def _export(command: Command) -> None:

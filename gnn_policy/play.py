@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,6 +26,7 @@ from mapf_env.problem_file import PROBLEM_SUFFIXES, load_problem
 if TYPE_CHECKING:
     from gnn_policy.rollout import Rollouts
 
+PROG = "python -m gnn_policy.play"
 PATIENCE = 4
 """T_max in lengths of the longest distance from a start to its goal."""
 
@@ -71,14 +73,14 @@ class Command:
     """Print the traceback of an error."""
 
 
-def parse(arguments: Sequence[str]) -> Command:
+def parse(arguments: Sequence[str], prog: str = PROG) -> Command:
     """Return the command that the arguments ask for."""
-    return parse_options(Command, arguments, prog="python -m gnn_policy.play")
+    return parse_options(Command, arguments, prog=prog)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, *, prog: str = PROG) -> int:
     """Run the command; returns 0 if every team has reached its goals (always in lifelong tasks), else 1."""
-    return run_command(parse, _play, arguments)
+    return run_command(partial(parse, prog=prog), _play, arguments)
 
 
 def _play(command: Command) -> int:

@@ -10,13 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from gnn_policy.settings import check_types
-from mapf_env.arguments import MOST_INT, integer
+from mapf_env.arguments import MOST_INT, integer, lists_settings
 from mapf_env.senses import Senses
 
 ENCODER_NAMES = ("released", "lean")
 GRAPH_LAYER_NAMES = ("filter", "attention")
 
 
+@lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicyConfig(Senses):
     """All that defines a policy besides its weights: the network, and what its robots perceive.

@@ -15,6 +15,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, cast
@@ -30,6 +31,7 @@ from gnn_policy.failures import MEANINGS
 from gnn_policy.paper_rates import PAPER, TEAMS
 from mapf_env.files import write_whole
 
+PROG = "python -m gnn_policy.report"
 STYLE = """
 body{margin:0;font:15px/1.5 system-ui,sans-serif;background:#f6f7f9;color:#1f2530}
 main{max-width:1000px;margin:auto;padding:16px}
@@ -278,14 +280,14 @@ def side_by_side(*diagrams: Axes) -> str:
     return f"<section>{''.join(pictures)}</section>"
 
 
-def parse(arguments: Sequence[str]) -> Options:
+def parse(arguments: Sequence[str], prog: str = PROG) -> Options:
     """Return the command that the arguments ask for."""
-    return tyro.cli(Options, args=arguments, prog="python -m gnn_policy.report", description=__doc__)
+    return tyro.cli(Options, args=arguments, prog=prog, description=__doc__)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None, *, prog: str = PROG) -> None:
     """Run the command."""
-    run_command(parse, write_report, arguments)
+    run_command(partial(parse, prog=prog), write_report, arguments)
 
 
 def write_report(options: Options) -> None:

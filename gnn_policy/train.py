@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +22,8 @@ from gnn_policy.run_folder import RESULTS, check_run, is_finished
 
 if TYPE_CHECKING:
     from gnn_policy.processes import Process
+
+PROG = "python -m gnn_policy.train"
 
 
 @dataclass(frozen=True)
@@ -52,21 +55,19 @@ class _Defaults:
     init: str | None = None
 
 
-def parse(arguments: Sequence[str]) -> Command:
+def parse(arguments: Sequence[str], prog: str = PROG) -> Command:
     """Return the command that the arguments ask for.
 
     The recipe or the file of settings among them decides the other defaults; `--init` decides the network, its senses
     and its execution.
     """
-    chosen, _ = tyro.cli(_Defaults, args=arguments, return_unknown_args=True, add_help=False)
+    chosen, _ = tyro.cli(_Defaults, args=arguments, return_unknown_args=True, add_help=False, prog=prog)
     config = RECIPES[chosen.recipe] if chosen.file is None else TrainConfig.load(chosen.file)
     if chosen.init is not None:  # a file of settings with `init` has the policy and execution that belong to it
         config = replace(
             config, policy=checkpoint.config_of(chosen.init), execution=checkpoint.executed_as(chosen.init)
         )
-    command = parse_options(
-        Command, arguments, default=Command(config, chosen.recipe, chosen.file), prog="python -m gnn_policy.train"
-    )
+    command = parse_options(Command, arguments, default=Command(config, chosen.recipe, chosen.file), prog=prog)
     _refuse_unused(command.config, config)
     return command
 
@@ -86,9 +87,9 @@ def _refuse_unused(config: TrainConfig, defaults: TrainConfig) -> None:
             raise ValueError(f"--{name.replace('_', '-')} has no effect on a training with {source}: {cure}")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None, *, prog: str = PROG) -> None:
     """Run the command."""
-    run_command(parse, _start, arguments)
+    run_command(partial(parse, prog=prog), _start, arguments)
 
 
 def _start(command: Command) -> None:

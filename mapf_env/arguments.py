@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Iterator, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import fields
+from difflib import get_close_matches
+from functools import cache, wraps
 from numbers import Real
 from typing import Any, TypeVar
 
@@ -33,6 +35,32 @@ def each_of(values: Iterable[T], kind: type[T], name: str) -> Iterator[T]:
     except TypeError:
         raise TypeError(f"{name} must be a sequence of {_public_name(kind)}, got {type(values).__name__}") from None
     return (instance_of(value, kind, f"{name}[{index}]") for index, value in enumerate(iterator))
+
+
+def known_settings(given: Iterable[str], known: Iterable[str], owner: str = "") -> None:
+    """Raise TypeError if a setting is not one of those `known`; the message names the owner, if any, and lists them."""
+    every = sorted(known)
+    for name in given:
+        if name not in every:
+            near = get_close_matches(name, every, 1)
+            listed = f"he settings are {', '.join(every)}"
+            advice = f"did you mean {near[0]!r}? T{listed}" if near else f"t{listed}"
+            where = f"{owner} has" if owner else "there is"
+            raise TypeError(f"{where} no setting {name!r}: {advice}")
+
+
+def lists_settings(kind: type[T]) -> type[T]:
+    """Let a dataclass refuse an unknown setting with a message that lists its settings, as `known_settings` does."""
+    made: Callable[..., None] = kind.__init__
+    known = [each.name for each in fields(kind) if each.init]  # pyright: ignore[reportArgumentType]
+
+    @wraps(made)
+    def init(self: T, *values: Any, **settings: Any) -> None:
+        known_settings(settings, known, kind.__name__)
+        made(self, *values, **settings)
+
+    kind.__init__ = init
+    return kind
 
 
 def choice(value: object, known: Sequence[str], name: str) -> None:

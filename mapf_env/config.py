@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from typing import Any, Literal, get_args
 
 import numpy.typing as npt
@@ -20,6 +19,7 @@ Task = Literal["one_shot", "lifelong"]
 Dtype = Literal["float32", "uint8"]
 
 
+@arguments.lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvConfig(Senses):
     """The settings of an environment: those of `Senses` and these; the defaults are the paper's setup.
@@ -99,13 +99,7 @@ def configured(settings: dict[str, Any], options: Iterable[str], grid: npt.Array
         TypeError: If a setting is unknown; the message lists those that exist.
         ValueError: If a setting is out of range or contradicts the map.
     """
-    known = [each.name for each in fields(EnvConfig)]
-    for name in settings:
-        if name not in known:
-            every = sorted([*known, *options])
-            near = get_close_matches(name, every, 1)
-            hint = f"did you mean {near[0]!r}? " if near else ""
-            raise TypeError(f"there is no setting {name!r}: {hint}The settings are {', '.join(every)}")
+    arguments.known_settings(settings, [*(each.name for each in fields(EnvConfig)), *options])
     if grid is None:
         return EnvConfig(**settings)
     for name, length in zip(("height", "width"), as_obstacles(grid).shape, strict=True):

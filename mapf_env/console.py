@@ -1,6 +1,8 @@
 """The command `mapf-env`: the commands of all packages under one name.
 
-A package offers its commands as entry points of the group "mapf_env.commands"; this module knows none of them.
+A package offers a command as an entry point of the group "mapf_env.commands": a function that takes the arguments after
+the command's name and, as the keyword `prog`, its name for help and errors ("mapf-env play"), and returns the exit
+status (None means 0).
 """
 
 from __future__ import annotations
@@ -10,6 +12,15 @@ from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points, version
 
 GROUP = "mapf_env.commands"
+PURPOSES = {
+    "evaluate": "measure a policy on held-out maps",
+    "export": "write a policy as ONNX, for robots without PyTorch",
+    "play": "run a policy on your own map and write a page that replays it",
+    "report": "put training runs on one page",
+    "solve": "solve an instance with a solver",
+    "train": "train a policy, evaluate it and draw the results",
+}
+"""One line for each command of this distribution; an entry point has no room for it, and importing takes long."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError as missing:
         print(f"mapf-env {given[0]}: {' '.join(str(missing).split())}", file=sys.stderr)
         return 2
-    return command(given[1:]) or 0
+    return command(given[1:], prog=f"mapf-env {given[0]}") or 0
 
 
 def _usage(commands: dict[str, EntryPoint]) -> str:
@@ -39,8 +50,8 @@ def _usage(commands: dict[str, EntryPoint]) -> str:
         [
             "usage: mapf-env COMMAND ...",
             "",
-            "Commands, each with the function that it runs:",
-            *(f"  {name:{width}}{command.value}" for name, command in commands.items()),
+            "Commands:",
+            *(f"  {name:{width}}{PURPOSES.get(name, command.value)}" for name, command in commands.items()),
             "",
             "`mapf-env COMMAND --help` lists the options of a command, `mapf-env --version` prints the version.",
         ]

@@ -16,6 +16,7 @@ STYLES: tuple[MapStyle, ...] = ("cells", "walls", "maze", "room", "warehouse", "
 """In the native core's order."""
 
 
+@arguments.lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Maze:
     """Corridors between walls one cell thick; the style "maze" with its parts chosen.
@@ -35,6 +36,7 @@ class Maze:
         arguments.share(self.loops, "the loops of a Maze")
 
 
+@arguments.lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Walls:
     """Walls one cell thick that grow in steps of two cells; the style "walls" with its parts chosen.
@@ -60,6 +62,7 @@ class Walls:
         arguments.flag(self.ring, "the ring of Walls")
 
 
+@arguments.lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rooms:
     """Square rooms between walls one cell thick, with a door between any two neighbours; the style "room".
@@ -76,6 +79,7 @@ class Rooms:
         _check_parts(self)
 
 
+@arguments.lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Warehouse:
     """Shelves in rows, the same for every seed; the style "warehouse".

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from mapf_env import arguments
 
 
+@arguments.lists_settings
 @dataclass(frozen=True, slots=True)
 class Rewards:
     """The reward of a robot in a step, as the sum of the parts that apply.

@@ -61,6 +61,7 @@ def edge_features(memory: int = 4) -> dict[str, Feature]:
     return {row[0]: Feature(*row) for row in _native.edge_features(memory)}
 
 
+@arguments.lists_settings
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Senses:
     """The settings of a robot's perception: views, features and communication; the defaults are the paper's.

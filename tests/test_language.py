@@ -1,4 +1,4 @@
-"""The English of code, options and messages: phrases that CONTRIBUTING.md rules out do not come back."""
+"""The English of code, messages and pages: phrases that CONTRIBUTING.md rules out do not come back."""
 
 import ast
 import re
@@ -15,6 +15,7 @@ CODE = sorted(
     for path in (ROOT / folder).rglob("*")
     if path.suffix in {".py", ".cpp", ".hpp"} and path != Path(__file__)
 )
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "gnn_policy").rglob("*.md")])
 PHRASES = {
     r"(?<![Tt]here )\b(is|are|was|were) no (?!longer\b|more\b|less\b|worse\b)": '"is not a"',
     r"\banew\b": '"again"',
@@ -69,6 +70,25 @@ def test_the_phrases_of_the_list_do_not_occur(folder: str) -> None:
         for number, line in words_of(path)
         for phrase, better in PHRASES.items()
         if re.search(phrase, line)
+    ]
+    assert not found, "\n".join(found)
+
+
+def prose_of(page: Path) -> Iterator[tuple[int, str]]:
+    """The paragraphs of a page in one line each, with their line numbers; without the examples of CONTRIBUTING.md."""
+    text = page.read_text(encoding="utf-8")
+    for paragraph in re.finditer(r"\S(?:.|\n(?!\n))*", text):
+        if not (page.name == "CONTRIBUTING.md" and paragraph[0].startswith("1. Use plain")):
+            yield text.count("\n", 0, paragraph.start()) + 1, " ".join(paragraph[0].split())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_phrases_of_the_list_do_not_occur_on_pages(page: Path) -> None:
+    found = [
+        f"{page.relative_to(ROOT)}:{number}: ... {text[max(match.start() - 40, 0) : match.end() + 40]} ...  -> {better}"
+        for number, text in prose_of(page)
+        for phrase, better in PHRASES.items()
+        for match in re.finditer(phrase, text, re.IGNORECASE)
     ]
     assert not found, "\n".join(found)
 

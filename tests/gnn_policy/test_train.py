@@ -76,7 +76,7 @@ def test_a_file_of_settings_is_the_base_of_the_other_options_and_names_the_run(t
     ("content", "words"),
     [
         (None, "none.toml"),
-        ("round = 2", "there is no setting 'round': the settings are aggregation"),
+        ("round = 2", "there is no setting 'round': did you mean 'rounds'? The settings are aggregation"),
         ("rounds = 0", "rounds must be positive"),
         ("rounds =", "bad.toml"),
     ],

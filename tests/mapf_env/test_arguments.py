@@ -1,5 +1,6 @@
 """Public calls of mapf_env: the message names the wrong argument."""
 
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import asdict
@@ -12,7 +13,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import mapf_env
-from mapf_env import BatchedEnv, EnvConfig, Instance, Rewards, Scene, Solution
+from mapf_env import BatchedEnv, EnvConfig, Instance, Maze, Rewards, Rooms, Scene, Solution, Walls, Warehouse
 from mapf_env.arguments import MOST_INT
 from wrong_arguments import (
     ARRAY,
@@ -401,3 +402,14 @@ def test_a_file_in_no_folder_is_refused_by_its_name(tmp_path: Path) -> None:
         mapf_env.save_map(tmp_path / "none" / "a.map", GRID)
     with pytest.raises(IsADirectoryError, match="is a folder: give the name of a file"):
         mapf_env.save_map(tmp_path, GRID)
+
+
+@pytest.mark.parametrize("kind", [EnvConfig, mapf_env.Senses, Rewards, Maze, Rooms, Walls, Warehouse])
+def test_an_unknown_setting_is_refused_with_all_that_exist(kind: Callable[..., Any]) -> None:
+    names = sorted(inspect.signature(kind).parameters)
+    assert names
+    with pytest.raises(TypeError) as refusal:
+        kind(nonsense=1)
+    assert str(refusal.value) == (f"{kind.__name__} has no setting 'nonsense': the settings are {', '.join(names)}")
+    with pytest.raises(TypeError, match=f"did you mean '{names[0]}'. The settings are {', '.join(names)}"):
+        kind(**{names[0][:-1]: 1})

@@ -24,10 +24,32 @@ def test_help_lists_the_commands_and_a_wrong_one_names_them(capsys: pytest.Captu
     told = capsys.readouterr().out
     for name in ("play", "solve", "train", "evaluate", "export", "report"):
         assert f"\n  {name}" in told
+        assert console.PURPOSES[name] in told
         assert console.main(["nonsense"]) == 2
         assert name in capsys.readouterr().err
+    assert "gnn_policy." not in told
     assert console.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("mapf-env 0.")
+
+
+@pytest.mark.parametrize("name", ["play", "solve", "train", "evaluate", "export", "report"])
+def test_help_and_errors_of_a_command_show_the_name_that_it_was_called_by(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        console.main([name, "--help"])
+    assert capsys.readouterr().out.startswith(f"usage: mapf-env {name} ")
+    with pytest.raises(SystemExit) as end:
+        console.main([name, "--no-such-option"])
+    assert end.value.code == 2
+    refused = capsys.readouterr().err
+    assert f"mapf-env {name} --help" in refused
+    assert "python -m" not in refused
+
+
+def test_an_error_of_solve_begins_with_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert console.main(["solve", "none.scen"]) == 2
+    assert capsys.readouterr().err.startswith("mapf-env solve: ")
 
 
 @pytest.mark.parametrize("name", ["play", "train", "evaluate", "export", "report"])

@@ -127,5 +127,5 @@ def test_an_unknown_setting_is_refused_with_the_nearest_one_and_all_that_exist(m
         TypeError, match=r"there is no setting 'fov_radios': did you mean 'fov_radius'\? .*comm_radius, "
     ):
         make(fov_radios=3)
-    with pytest.raises(TypeError, match=r"there is no setting 'xyz': The settings are .*cases, .*, grid, .*, width"):
+    with pytest.raises(TypeError, match=r"there is no setting 'xyz': the settings are .*cases, .*, grid, .*, width"):
         make(xyz=3)
