@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -120,23 +121,34 @@ def _plain(scene: Scene, config: EnvConfig) -> dict[str, object]:
         "rows": ["".join("@" if cell else "." for cell in row) for row in scene.instance.grid],
         "goals": scene.instance.goals.tolist(),
         "comm_radius": min(radius, 1e9),
-        "colours": svg.colours(scene.instance.num_agents),
+        "colours": svg.colours(min(scene.instance.num_agents, _MOST_COLOURS)),
         "panels": [
             {
                 "name": name,
-                "paths": each.paths.tolist(),
-                "goals": _changes(changing[name]) if name in changing else None,
+                "paths": _track(each.paths),
+                "goals": _track(changing[name]) if name in changing else None,
             }
             for name, each in scene.solutions.items()
         ],
     }
 
 
-def _changes(goals: Cells) -> list[list[list[int]]]:
-    """Return the goals of each robot, each with the time from which it holds: [time, row, column]."""
-    changed = np.ones(goals.shape[:2], np.bool_)
-    changed[1:] = np.any(goals[1:] != goals[:-1], axis=2)
-    return [
-        [[time, *goals[time, robot].tolist()] for time in np.flatnonzero(changed[:, robot]).tolist()]
-        for robot in range(goals.shape[1])
-    ]
+_MOST_COLOURS = 256
+"""Robots of larger teams share colours: the page draws all robots of one colour at once."""
+
+_LETTERS = np.frombuffer(b"jujlwrjdj", np.uint8)
+"""Letters of the moves by 3 * (rows + 1) + columns + 1: up, left, wait, right, down, and jumps."""
+
+
+def _track(cells: Cells) -> dict[str, object]:
+    """Return cells (T + 1, N, 2) as the first ones and a string of N letters for each step; jumps are listed as well."""
+    moves, jumps = list[str](), dict[int, list[list[int]]]()
+    for step, (before, after) in enumerate(pairwise(cells)):
+        change = after - before
+        near = (np.abs(change) <= 1).all(axis=1)
+        letters = _LETTERS[np.where(near, change @ (3, 1) + 4, 0)]
+        moves.append(letters.tobytes().decode("ascii"))
+        robots = np.flatnonzero(letters == ord("j"))
+        if len(robots):
+            jumps[step] = np.column_stack([robots, change[robots]]).tolist()
+    return {"starts": cells[0].tolist(), "moves": moves, "jumps": jumps}

@@ -9,6 +9,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -253,3 +254,20 @@ def mixed(seed: int, counter: int) -> int:
     word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 % 2**64
     word = (word ^ word >> 27) * 0x94D049BB133111EB % 2**64
     return word ^ word >> 31
+
+
+def track_of_a_replay(track: dict[str, Any]) -> list[list[list[int]]]:
+    """Cells of each robot at each time, read from the data of a replay page."""
+    times = [[list(cell) for cell in track["starts"]]]
+    for step, letters in enumerate(track["moves"]):
+        jumps = {robot: change for robot, *change in track["jumps"].get(str(step), [])}
+        assert set(jumps) == {robot for robot, letter in enumerate(letters) if letter == "j"}
+        changes = [{"u": (-1, 0), "l": (0, -1), "d": (1, 0), "r": (0, 1), "w": (0, 0)}.get(each) for each in letters]
+        times.append(
+            [
+                [row + down, col + right]
+                for robot, ((row, col), change) in enumerate(zip(times[-1], changes, strict=True))
+                for down, right in [jumps[robot] if change is None else change]
+            ]
+        )
+    return times

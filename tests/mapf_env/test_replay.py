@@ -1,6 +1,7 @@
 """The page of a replay, in a real headless Chromium where there is one."""
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -8,7 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
+import oracles
 from mapf_env import BatchedEnv, EnvConfig, Instance, Scene, Solution, animate, random_instance, replay, replay_scenes
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -16,13 +21,13 @@ BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil
 ACTIONS = """
 <script>{
 window.onerror = (message) => { document.body.dataset.said = JSON.stringify({error: message}); };
-const {canvas, pen, status, side, W, H, last, paths} = state.panels[0];
+const {canvas, pen, status, side, W, H, last, here} = state.panels[0];
 const said = [], box = canvas.getBoundingClientRect();
 const scale = Math.max(W * side / box.width, H * side / box.height);
 const click = (row, col) => canvas.dispatchEvent(new MouseEvent("click", {
   clientX: box.left + (col + 0.5) * side / scale, clientY: box.top + (row + 0.5) * side / scale}));
 said.push(status.textContent);
-click(paths[0][0][0], paths[0][0][1]);
+click(here.rows[0], here.cols[0]);
 said.push(status.textContent);
 slider.value = last; slider.oninput();
 said.push(status.textContent);
@@ -48,13 +53,12 @@ document.body.dataset.said = JSON.stringify({said, played, frames, paused: state
 
 STROKES = """
 <script>{
-let strokes = 0;
-const {pen} = state.panels[0];
-for (const name of ["arc", "drawImage", "fillRect", "lineTo", "strokeRect"]) {
+const strokes = {}, {pen} = state.panels[0];
+for (const name of ["arc", "drawImage", "fill", "fillRect", "fillText", "lineTo", "rect", "stroke", "strokeRect"]) {
   const draws = pen[name].bind(pen);
-  pen[name] = (...where) => { strokes++; draws(...where); };
+  pen[name] = (...where) => { strokes[name] = (strokes[name] ?? 0) + 1; draws(...where); };
 }
-state.time = 0.5; state.chosen = 0;
+state.time = 1.5; state.chosen = 0;
 draw();
 document.body.dataset.said = JSON.stringify({strokes});
 }</script></body>"""
@@ -96,6 +100,29 @@ press("Escape"); press("x");
 const box = state.panels[0].canvas.getBoundingClientRect();
 const fits = [box.right <= innerWidth, box.bottom <= innerHeight, Math.abs(box.width / box.height - 3) < 0.02];
 document.body.dataset.said = JSON.stringify({said, fits, wide: document.documentElement.scrollWidth <= innerWidth});
+}</script></body>"""
+
+CROWD = """
+<script>{
+window.onerror = (message) => { document.body.dataset.said = JSON.stringify({error: message}); };
+const [once, always] = state.panels, pictures = [], {pen, side} = once;
+let strokes = {};
+for (const name of ["arc", "drawImage", "fill", "fillRect", "fillText", "lineTo", "rect", "stroke", "strokeRect"]) {
+  const draws = pen[name].bind(pen);
+  pen[name] = (...where) => { strokes[name] = (strokes[name] ?? 0) + 1; draws(...where); };
+}
+const sum = (values) => values.reduce((total, value, i) => total + value * ((i + 1) % 97), 0);
+for (const time of [0, 200, 3, 120.75, 119.5, 49.5, 0.25, 60]) {
+  strokes = {};
+  slider.value = time; slider.oninput();
+  const sums = [always.here, always.there, always.goals].map(({rows, cols}) => [sum(rows), sum(cols)]);
+  pictures.push([time, sums.flat(), strokes]);
+}
+const {rows, cols} = once.here;
+const [r, g, b] = pen.getImageData(Math.floor((cols[9999] + 0.5) * side), Math.floor((rows[9999] + 0.5) * side), 1, 1).data;
+const painted = "#" + [r, g, b].map((each) => each.toString(16).padStart(2, "0")).join("");
+const [first, second] = state.panels.map(({status}) => status.textContent);
+document.body.dataset.said = JSON.stringify({pictures, painted, first, second});
 }</script></body>"""
 
 
@@ -185,12 +212,19 @@ def test_a_page_shows_something() -> None:
 
 
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
-def test_a_picture_costs_two_strokes_a_robot_whatever_the_map(tmp_path: Path) -> None:
-    instance = random_instance(height=60, width=60, num_agents=500, seed=0)
+@pytest.mark.parametrize(("side", "strokes_a_robot"), [(60, 2), (150, 1), (300, 1)])
+def test_a_picture_costs_one_stroke_a_robot_and_its_number_if_it_has_one(
+    tmp_path: Path, side: int, strokes_a_robot: int
+) -> None:
+    instance = random_instance(height=side, width=side, num_agents=500, seed=0)
     page = replay(instance, Solution(np.repeat(instance.starts[None], 30, axis=0)))
     strokes = browse(page, STROKES, tmp_path)["strokes"]
-    assert isinstance(strokes, int)
-    assert 1000 < strokes < 1000 + 100, "a goal and a robot each, and what the chosen one knows"
+    assert isinstance(strokes, dict)
+    assert strokes["drawImage"] == 2, "the floor, and the goals"
+    assert strokes["fill"] == 256, "a path for each colour"
+    outlines = sum(strokes.get(name, 0) for name in ("arc", "fillText", "rect", "strokeRect"))
+    most = 500 * strokes_a_robot + 100
+    assert 500 * strokes_a_robot < outlines < most, "the robots, and what the chosen one knows"
 
 
 def test_the_page_is_self_contained_and_no_text_ends_its_script(tmp_path: Path) -> None:
@@ -226,25 +260,20 @@ def test_lifelong_episodes_show_the_goals_of_each_time() -> None:
     assert arrivals > 3
     page = replay(instance, solution, goals=goals)
     (panel,) = json.loads(re.findall(r"^const data = (.*);$", page, re.MULTILINE)[0])["scenes"][0]["panels"]
-    for robot, changes in enumerate(panel["goals"]):
-        times = [time for time, *_ in changes]
-        assert times == sorted(set(times))
-        for time, aims in enumerate(goals[:, robot].tolist()):
-            assert next(cell for begun, *cell in reversed(changes) if begun <= time) == aims
+    assert oracles.track_of_a_replay(panel["paths"]) == solution.paths.tolist()
+    assert oracles.track_of_a_replay(panel["goals"]) == goals.tolist()
     if NODE:
-        functions = re.findall(r"^function (?:goal|arrivals)\(.*?^}$", page, re.MULTILINE | re.DOTALL)
-        assert len(functions) == 2
+        parts = re.findall(r"^(?:class Track|function arrivals|for \(const \[letter).*?^}$", page, re.M | re.S)
+        assert len(parts) == 3
         program = "\n".join(
             [
-                *functions,
+                *parts,
                 f"const paths = {json.dumps(panel['paths'])}, goals = {json.dumps(panel['goals'])};",
-                "const seen = paths.map((_, t) => paths[0].map((_, i) => goal({goals}, i, t)));",
-                "console.log(JSON.stringify([seen, arrivals(paths, goals)]));",
+                "console.log(JSON.stringify(arrivals(paths, goals)));",
             ]
         )
         done = subprocess.run([NODE, "-e", program], capture_output=True, text=True, check=True)
-        seen, counts = json.loads(done.stdout)
-        assert seen == goals.tolist()
+        counts = json.loads(done.stdout)
         assert (len(counts), counts[0], counts[-1]) == (61, 0, arrivals)
     picture = animate(instance, solution, goals=goals)
     assert f">{arrivals} arrivals</tspan>" in picture
@@ -258,7 +287,62 @@ def test_scenes_may_have_goals_that_change_for_some_of_their_solutions() -> None
     page = replay_scenes([scene], title="two")
     panels = json.loads(re.findall(r"^const data = (.*);$", page, re.MULTILINE)[0])["scenes"][0]["panels"]
     assert panels[0]["goals"] is None
-    assert [changes[0] for changes in panels[1]["goals"]] == [[0, *goal] for goal in instance.goals.tolist()]
+    assert panels[1]["goals"]["starts"] == instance.goals.tolist()
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    paths=arrays(
+        np.int64,
+        st.tuples(st.integers(1, 6), st.integers(1, 4), st.just(2)),
+        elements=st.integers(0, 3) | st.integers(0, 89),
+    )
+)
+def test_paths_are_sent_move_by_move_with_their_jumps(paths: np.ndarray) -> None:
+    robots = paths.shape[1]
+    rest = np.column_stack([np.zeros(robots, int), np.arange(robots)])
+    page = replay(Instance(np.zeros((90, 90), bool), rest, rest), Solution(paths))
+    (panel,) = json.loads(re.findall(r"^const data = (.*);$", page, re.MULTILINE)[0])["scenes"][0]["panels"]
+    assert oracles.track_of_a_replay(panel["paths"]) == paths.tolist()
+
+
+def crowd() -> tuple[Instance, Solution, np.ndarray]:
+    """Random moves and jumps of 10,000 robots over 200 steps with goals that change, and these goals."""
+    generator, robots, side = np.random.default_rng(0), 10_000, 512
+    cells = generator.permutation(side * side)[: 2 * robots].reshape(2, robots)
+    starts, aims = (np.stack(np.divmod(each, side), axis=-1) for each in cells)
+    moves = np.array([(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)])[generator.integers(0, 5, (200, robots))]
+    paths = np.clip(starts + np.concatenate([np.zeros((1, robots, 2), int), np.cumsum(moves, axis=0)]), 0, side - 1)
+    paths[50:, 7] = paths[:-50, 8]
+    goals = np.repeat(aims[None], 201, axis=0)
+    goals[100:] = paths[::-1][100:]
+    return Instance(np.zeros((side, side), bool), starts, aims), Solution(paths), goals
+
+
+@pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
+def test_ten_thousand_robots_are_sought_and_played_from_a_small_page(tmp_path: Path) -> None:
+    instance, solution, goals = crowd()
+    scene = Scene("", instance, {"once": solution, "for ever": solution}, {"for ever": goals})
+    page = replay_scenes([scene], title="many")
+    assert len(page) < 30e6 / 3, "three strings of moves"
+    told = browse(page, CROWD, tmp_path)
+    paths, weights = solution.paths.astype(np.int64), np.arange(1, 10_001)[:, None] % 97
+    pictures = told["pictures"]
+    assert isinstance(pictures, list)
+    assert [time for time, *_ in pictures] == [0, 200, 3, 120.75, 119.5, 49.5, 0.25, 60]
+    for time, sums, strokes in pictures:
+        whole, nearest = math.floor(time), math.floor(time + 0.5)
+        cells = (paths[whole], paths[min(whole + 1, 200)], goals[nearest])
+        assert sums == [int(total) for each in cells for total in (each * weights).sum(axis=0)], time
+        if time < 200:  # then late robots wear rings
+            assert strokes == {"drawImage": 2, "rect": 10_000, "fill": 256, "stroke": 1}, "goals are painted already"
+    page_data = json.loads(re.findall(r"^const data = (.*);$", page, re.MULTILINE)[0])
+    colours = page_data["scenes"][0]["colours"]
+    assert told["painted"] == colours[9999 % len(colours)]
+    home = int((paths[60] == instance.goals).all(axis=1).sum())
+    arrived = (paths[1:] == goals[:-1]).all(axis=2) & ~(paths[:-1] == goals[:-1]).all(axis=2)
+    assert told["first"] == f"step 60 of 200, {home} of 10000 on goal"
+    assert told["second"] == f"step 60 of 200, {arrived[:60].sum()} arrivals"
 
 
 def test_goals_of_another_episode_are_refused() -> None:
