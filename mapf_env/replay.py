@@ -141,7 +141,7 @@ _LETTERS = np.frombuffer(b"jujlwrjdj", np.uint8)
 
 
 def _track(cells: Cells) -> dict[str, object]:
-    """Return cells (T + 1, N, 2) as the first ones and a string of N letters for each step; jumps are listed as well."""
+    """Return cells (T + 1, N, 2) as the first ones and a string of N letters for each step, with a list of jumps."""
     moves, jumps = list[str](), dict[int, list[list[int]]]()
     for step, (before, after) in enumerate(pairwise(cells)):
         change = after - before

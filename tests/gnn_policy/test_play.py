@@ -4,6 +4,7 @@ import json
 import re
 import sys
 from dataclasses import fields
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -51,7 +52,7 @@ def test_a_scenario_is_played_as_it_stands(home, capsys):
     assert paths[0] == instance.starts.tolist()
     assert len(paths) == 31
     assert (data["fov_radius"], scene["comm_radius"]) == (2, 3.0)
-    for before, after in zip(paths, paths[1:], strict=False):
+    for before, after in pairwise(paths):
         assert not oracles.faults(instance.grid, oracles.cells(before), oracles.cells(after))
     home_now = sum(cell == goal for cell, goal in zip(paths[-1], scene["goals"], strict=True))
     told = capsys.readouterr().out
@@ -124,7 +125,7 @@ def test_a_lifelong_team_plays_to_the_last_step_and_its_arrivals_are_reported(ho
     (panel,) = scene["panels"]
     paths = oracles.track_of_a_replay(panel["paths"])
     assert len(paths) == 26
-    for before, after in zip(paths, paths[1:], strict=False):
+    for before, after in pairwise(paths):
         assert not oracles.faults(instance.grid, oracles.cells(before), oracles.cells(after))
     told = capsys.readouterr().out
     assert "arrivals" in told

@@ -119,7 +119,8 @@ for (const time of [0, 200, 3, 120.75, 119.5, 49.5, 0.25, 60]) {
   pictures.push([time, sums.flat(), strokes]);
 }
 const {rows, cols} = once.here;
-const [r, g, b] = pen.getImageData(Math.floor((cols[9999] + 0.5) * side), Math.floor((rows[9999] + 0.5) * side), 1, 1).data;
+const [x, y] = [cols[9999], rows[9999]].map((cell) => Math.floor((cell + 0.5) * side));
+const [r, g, b] = pen.getImageData(x, y, 1, 1).data;
 const painted = "#" + [r, g, b].map((each) => each.toString(16).padStart(2, "0")).join("");
 const [first, second] = state.panels.map(({status}) => status.textContent);
 document.body.dataset.said = JSON.stringify({pictures, painted, first, second});
