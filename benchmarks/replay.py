@@ -61,7 +61,7 @@ addEventListener("load", () => setTimeout(measure, 1000));
 
 @dataclass(frozen=True)
 class Options:
-    """What to write and play."""
+    """The page to write, and how to play it."""
 
     robots: int = 10_000
     """Team size."""
@@ -78,7 +78,7 @@ class Options:
 
 
 def episode(options: Options) -> tuple[Instance, Solution]:
-    """Random moves under the paper's shield."""
+    """Return an episode of random moves under the shield of the paper."""
     side, robots = options.side, options.robots
     instance = random_instance(height=side, width=side, density=0.1, num_agents=robots, seed=options.seed)
     env = BatchedEnv(1, num_agents=robots, height=side, width=side, density=0.0, style="empty", max_cycles=10**9)
@@ -92,7 +92,7 @@ def episode(options: Options) -> tuple[Instance, Solution]:
 
 
 def cpu_seconds(session: int) -> float:
-    """CPU time of all processes of a session so far; they are those of Chromium, which draws in several."""
+    """Return the CPU time of all processes of a session; Chromium draws in several."""
     ticks = 0
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -105,7 +105,7 @@ def cpu_seconds(session: int) -> float:
 
 
 def played(page: str, options: Options) -> dict[str, float]:
-    """What Chromium measured while it played the page.
+    """Play the page in Chromium and return what it measured.
 
     Raises:
         FileNotFoundError: If there is no Chromium.
@@ -133,7 +133,7 @@ def played(page: str, options: Options) -> dict[str, float]:
                 answered.set()
 
         def log_message(self, format: str, *values: Any) -> None:
-            """Nothing: the measurements are all that is printed."""
+            """Print nothing but the measurements."""
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server, tempfile.TemporaryDirectory() as folder:
         threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -323,7 +323,7 @@ def crowd() -> tuple[Instance, Solution, np.ndarray]:
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium to show the page")
 def test_ten_thousand_robots_are_sought_and_played_from_a_small_page(tmp_path: Path) -> None:
     instance, solution, goals = crowd()
-    scene = Scene("", instance, {"once": solution, "for ever": solution}, {"for ever": goals})
+    scene = Scene("", instance, {"once": solution, "forever": solution}, {"forever": goals})
     page = replay_scenes([scene], title="many")
     assert len(page) < 30e6 / 3, "three strings of moves"
     told = browse(page, CROWD, tmp_path)
