@@ -70,9 +70,9 @@ class Options:
     side: int = 512
     """Rows and columns of the map, a tenth of which are obstacles."""
     speed: int = 8
-    """Steps a second at which the page plays."""
+    """Steps per second at which the page plays."""
     seconds: float = 10.0
-    """How long it plays; at most as long as the episode."""
+    """Seconds that it plays; at most as long as the episode."""
     seed: int = 0
     """Seed of map, team and moves."""
 
