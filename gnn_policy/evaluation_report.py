@@ -134,7 +134,7 @@ def _animate(rollouts: Sequence[Rollouts], path: Path) -> None:
     lifelong = len(best.goals[case]) > 1
     outcome = "all on goal" if best.success[case] else "timed out"
     if lifelong:
-        outcome = f"{best.throughput[case]:.2f} arbaselines per step"
+        outcome = f"{best.throughput[case]:.2f} arrivals per step"
     title = f"Trained policy, {best.instances[case].num_agents} robots: {outcome}"
     goals = best.goals[case] if lifelong else None
     animate(best.instances[case], best.solutions[case], path, title=title, goals=goals)

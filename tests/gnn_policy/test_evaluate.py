@@ -212,6 +212,7 @@ def test_lifelong_teams_have_a_table_of_throughput(file, capsys):
     assert "arrivals" in shown
     assert "3 robots, 3 test maps" in shown
     assert ET.parse(numbers.parent / "animation.svg").getroot().tag.endswith("svg")
+    assert "arrivals per step" in (numbers.parent / "animation.svg").read_text()
     evaluate.main(arguments)
     assert numbers.read_bytes() == before
     capsys.readouterr()
