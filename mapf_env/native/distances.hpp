@@ -80,6 +80,23 @@ void distances_by_words(const Grid& grid, int goal, Distance* distance) {
     for (int cell = 0; cell < size; ++cell) distance[cell] = static_cast<Distance>(low_bytes[cell] | high_bytes[cell] << 8);
 }
 
+// Appends the neighbours of a cell that have no distance yet to the queue `open` of `tail` cells; returns its new length.
+// Obstacles have any other distance than `unreachable`, so that one comparison without a branch tells what is new. Throws
+// std::invalid_argument if a distance does not fit.
+inline std::size_t expand_cell(Distance* found, int* open, std::size_t tail, int cell,
+                               const std::array<int, num_actions>& steps) {
+    const auto next = static_cast<Distance>(found[cell] + 1);
+    if (next == unreachable) throw std::invalid_argument("a shortest path on this map is longer than 65533 steps");
+    for (int action = 0; action < idle; ++action) {
+        const int neighbour = cell + steps[action];
+        const bool is_new = found[neighbour] == unreachable;
+        found[neighbour] = is_new ? next : found[neighbour];
+        open[tail] = neighbour;
+        tail += is_new;
+    }
+    return tail;
+}
+
 // Steps from every cell to `goal` by breadth-first search, `unreachable` where there is no way. `queue` is scratch.
 // Throws std::invalid_argument if a distance does not fit.
 inline void distances_to(const Grid& grid, int goal, std::vector<Distance>& distance, std::vector<int>& queue) {
@@ -90,7 +107,7 @@ inline void distances_to(const Grid& grid, int goal, std::vector<Distance>& dist
         if (size <= 64 * 20) return distances_by_words<20>(grid, goal, distance.data());
     }
     queue.resize(size);
-    // Obstacles count as visited until the end, so that one comparison without a branch tells what is new.
+    // Obstacles count as visited until the end.
     for (std::size_t cell = 0; cell < size; ++cell) distance[cell] = grid.blocked[cell] ? 0 : unreachable;
     const auto steps = grid.layout.steps();
     Distance* const found = distance.data();
@@ -98,18 +115,7 @@ inline void distances_to(const Grid& grid, int goal, std::vector<Distance>& dist
     std::size_t head = 0, tail = 0;
     found[goal] = 0;
     open[tail++] = goal;
-    while (head < tail) {
-        const int cell = open[head++];
-        const auto next = static_cast<Distance>(found[cell] + 1);
-        if (next == unreachable) throw std::invalid_argument("a shortest path on this map is longer than 65533 steps");
-        for (int action = 0; action < idle; ++action) {
-            const int neighbour = cell + steps[action];
-            const bool is_new = found[neighbour] == unreachable;
-            found[neighbour] = is_new ? next : found[neighbour];
-            open[tail] = neighbour;
-            tail += is_new;
-        }
-    }
+    while (head < tail) tail = expand_cell(found, open, tail, open[head++], steps);
     for (std::size_t cell = 0; cell < size; ++cell) distance[cell] = grid.blocked[cell] ? unreachable : distance[cell];
 }
 

@@ -7,7 +7,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <optional>
-#include <stdexcept>
 #include <vector>
 
 #include "mapf_env/native/distances.hpp"
@@ -132,18 +131,7 @@ private:
         int* const open = open_.data();
         const std::size_t end = std::min(head_ + many, tail_);
         std::size_t tail = tail_;
-        for (; head_ < end; ++head_) {
-            const int cell = open[head_];
-            const auto next = static_cast<Distance>(found[cell] + 1);
-            if (next == unreachable) throw std::invalid_argument("a shortest path on this map is longer than 65533 steps");
-            for (int action = 0; action < idle; ++action) {
-                const int neighbour = cell + steps[action];
-                const bool is_new = found[neighbour] == unreachable;
-                found[neighbour] = is_new ? next : found[neighbour];
-                open[tail] = neighbour;
-                tail += is_new;
-            }
-        }
+        for (; head_ < end; ++head_) tail = expand_cell(found, open, tail, open[head_], steps);
         tail_ = tail;
     }
 
