@@ -52,17 +52,14 @@ def logits_of(policy: nn.Module, bag: Bag) -> Scores:
     """
     device = next((each.device for each in policy.parameters()), torch.device("cpu"))
     count = len(bag.team)
-    if count > _MOST_PADDED:
-        with torch.inference_mode():
-            return policy(tensors(bag, device)).float().cpu().numpy()
-    extra = _padded_size(count) - count
-    padded = bag._replace(
-        fov=np.pad(bag.fov, ((0, extra), (0, 0), (0, 0), (0, 0))),
-        scalars=np.pad(bag.scalars, ((0, extra), (0, 0))),
-        team=np.pad(bag.team, (0, extra), constant_values=bag.team.max(initial=-1) + 1),
-    )
+    if extra := _padded_size(count) - count:
+        bag = bag._replace(
+            fov=np.pad(bag.fov, ((0, extra), (0, 0), (0, 0), (0, 0))),
+            scalars=np.pad(bag.scalars, ((0, extra), (0, 0))),
+            team=np.pad(bag.team, (0, extra), constant_values=bag.team.max(initial=-1) + 1),
+        )
     with torch.inference_mode():
-        return policy(tensors(padded, device))[:count].float().cpu().numpy()
+        return policy(tensors(bag, device))[:count].float().cpu().numpy()
 
 
 def scores_of(policy: nn.Module, bag: Bag, execution: Execution, noise: Any) -> Scores:
@@ -143,4 +140,6 @@ _MOST_PADDED = 2**15
 
 
 def _padded_size(robots: int) -> int:
+    if robots > _MOST_PADDED:
+        return robots
     return 1 << (robots - 1).bit_length() if robots < 256 else -(-robots // 256) * 256
