@@ -9,7 +9,7 @@ from experts.prioritised_planning import prioritised
 from experts.priority_inheritance import pibt
 from experts.relabelling import relabel
 from experts.result import FoundBy, Result, Status
-from experts.rolling_horizon import RollingHorizon
+from experts.rolling_horizon import RollingHorizon, next_moves
 
 __all__ = [
     "FoundBy",
@@ -22,6 +22,7 @@ __all__ = [
     "label_plans",
     "lacam",
     "load_paths",
+    "next_moves",
     "pibt",
     "prioritised",
     "relabel",

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
 from experts import _native, arguments
-from mapf_env.instance import as_obstacles
+from mapf_env.instance import Instance, as_obstacles
 
 
 class RollingHorizon:
@@ -80,3 +82,39 @@ class RollingHorizon:
 
 
 _STEPS = np.array([(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)], np.int32)
+
+
+def next_moves(
+    instances: Sequence[Instance],
+    *,
+    window: int = arguments.DEFAULT_WINDOW,
+    rounds: int = arguments.DEFAULT_WINDOW_ROUNDS,
+    threads: int = 1,
+    seed: int = 0,
+) -> npt.NDArray[np.int8]:
+    """Return the next joint action of a `RollingHorizon` in each of many states: labels for lifelong tasks.
+
+    Each state is planned afresh, as by `RollingHorizon(grid, ...).act(starts, goals)`.
+
+    Args:
+        instances: The states: where robots are, and their current goals. Teams and maps may differ.
+        window: As for `RollingHorizon`.
+        rounds: As for `RollingHorizon`.
+        threads: Threads to share the states; the moves do not depend on it.
+        seed: As for `RollingHorizon`.
+
+    Returns:
+        (R,) int8, the `Action` of each robot of all states, one state after the other.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+        TypeError: If an argument has the wrong type.
+        KeyboardInterrupt: On Ctrl-C.
+    """
+    return _native.next_moves(
+        [(each.grid, each.starts, each.goals) for each in arguments.each_of(instances, Instance, "instances")],
+        arguments.at_least_one(window, "window", maximum=arguments.MAX_WINDOW),
+        arguments.at_least_one(rounds, "rounds", maximum=arguments.MAX_ROUNDS),
+        arguments.seed(seed),
+        arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS),
+    )

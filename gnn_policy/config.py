@@ -73,8 +73,8 @@ class TrainConfig:
     """Nodes that ECBS may generate for a validation or test case before LaCAM plans it; take fewer for crowds."""
 
     expert: str = "ecbs"
-    """The solver that shows the moves: "ecbs", "lacam", "prioritised", "pibt", or one of your own as
-    "module:function"."""
+    """The solver that shows the moves: "ecbs" (in lifelong tasks the planner with a rolling horizon takes its place),
+    "lacam", "prioritised", "pibt", or one of your own as "module:function"."""
     w: float = 1.05
     """ECBS's cost is at most w times the lower bound of the optimum, both for labels and for the plans that set T_max;
     other solvers are called without a w."""

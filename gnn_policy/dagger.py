@@ -41,9 +41,16 @@ class Mixture(TensorDictModuleBase):
     beta: torch.Tensor
     seed: torch.Tensor
 
-    def __init__(self, policy: DecentralizedPolicy, labeller: Labeller, config: TrainConfig, cases: Cases) -> None:
+    def __init__(
+        self,
+        policy: DecentralizedPolicy,
+        labeller: Labeller,
+        config: TrainConfig,
+        cases: Cases,
+        task: Task = "one_shot",
+    ) -> None:
         super().__init__()
-        self.policy, self.labeller, self.config = policy, labeller, config
+        self.policy, self.labeller, self.config, self.task = policy, labeller, config, task
         self._map_of = cases.map_of
         self._senses = config.rollout_execution.senses(config.policy)
         self._maps = MapSet(cases.grids, self._senses.fov_radius, "uint8")
@@ -74,7 +81,7 @@ class Mixture(TensorDictModuleBase):
         if not by_expert.all():
             scores[~guided] = self._score(states.take(~by_expert))
         if by_expert.any():
-            moves, _ = self.labeller.moves(states.take(by_expert))
+            moves, _ = self.labeller.moves(states.take(by_expert), self.task)
             scores[guided] = np.eye(len(Action), dtype=np.float32)[moves]
         sizes = np.diff(states.offsets)
         present = np.arange(tensordict[POSITIONS].shape[1]) < sizes[:, None]
@@ -146,8 +153,10 @@ class _Player:
     def __init__(
         self, config: TrainConfig, policy: DecentralizedPolicy, labeller: Labeller, task: Task, cases: Cases, teams: int
     ) -> None:
-        self._config, self._map_of = config, cases.map_of
-        self._mixture = Mixture(policy, labeller, config, cases)
+        self.task: Task = task
+        self.cases, self.teams = cases, teams
+        self._config = config
+        self._mixture = Mixture(policy, labeller, config, cases, task)
         self._mixture.begin(beta=1.0, seed=0)
         make_env = functools.partial(
             TeamEnv,
@@ -191,7 +200,7 @@ class _Player:
         chosen = played[torch.from_numpy(teams)].reshape(-1)
         if only_stuck:
             chosen = chosen[chosen["next", "truncated"][:, 0]]
-        return states_of(chosen, self._map_of)
+        return states_of(chosen, self.cases.map_of)
 
     def close(self) -> None:
         """Shut the collector down."""
@@ -209,7 +218,7 @@ class Demonstrator:
         cases: Cases,
         process: Process = Process(),
     ) -> None:
-        self._config, self._labeller, self._cases, self._map_of = config, labeller, cases, cases.map_of
+        self._config, self._labeller = config, labeller
         self._rank, self._num_processes = process.rank, process.count
         by_task = cases.by_task()
         teams = _split_teams(teams_side_by_side(config, process), by_task, config.collectors)
@@ -224,39 +233,43 @@ class Demonstrator:
             The demonstrations of all states of the round, or of plans from where teams were stuck, and the number of
             states that the expert could not solve.
         """
-        seed = int(np.random.SeedSequence([self._config.seed, round_number, self._rank]).generate_state(1)[0])
-        if round_number == 0 and self._config.aggregation == "plans":
-            starts = self._starts(steps, np.random.default_rng(seed))
-            return self._labeller.demonstrate(starts, self._config.plan_steps)
-        config, demonstrated = self._config, round_number == 0
-        aggregation = "visited" if demonstrated else config.aggregation
+        config = self._config
+        seed = int(np.random.SeedSequence([config.seed, round_number, self._rank]).generate_state(1)[0])
+        demonstrated = round_number == 0
+        aggregation = "visited" if demonstrated and config.aggregation == "stuck" else config.aggregation
         beta, mining = config.beta_decay**round_number, 1 if demonstrated else config.hard_case_mining
         times = -(-steps // (config.rollout_teams * config.rollout_length))
-        labelled = [
-            self._label(player.play(beta, seed, times, mining, only_stuck=aggregation == "stuck"), aggregation, seed)
-            for player in self._players
-        ]
+        labelled = []
+        for player in self._players:
+            if demonstrated and aggregation == "plans" and player.task == "one_shot":
+                starts = self._starts(player, steps, np.random.default_rng(seed))
+                labelled.append(self._labeller.demonstrate(starts, config.plan_steps))
+                continue
+            states = player.play(beta, seed, times, mining, only_stuck=aggregation == "stuck")
+            labelled.append(self._label(states, player.task, aggregation, seed))
         return Demonstrations.concatenate([part for part, _ in labelled]), sum(count for _, count in labelled)
 
-    def _label(self, states: States, aggregation: Aggregation, seed: int) -> tuple[Demonstrations, int]:
+    def _label(self, states: States, task: Task, aggregation: Aggregation, seed: int) -> tuple[Demonstrations, int]:
         config = self._config
         if aggregation == "stuck":
             return self._labeller.demonstrate(states)
-        if aggregation == "visited":
-            return self._labeller.label(states)
+        if aggregation == "visited" or task == "lifelong":
+            return self._labeller.label(states, task)
         weight = np.where(np.logical_or.reduceat(states.stuck(), states.offsets[:-1]), config.stuck_weight, 1.0)
         count = max(len(states) // config.plan_steps, 1)
         asked = np.random.default_rng(seed).choice(len(states), count, replace=False, p=weight / weight.sum())
         return self._labeller.demonstrate(states.take(np.sort(asked)), config.plan_steps)
 
-    def _starts(self, steps: int, rng: np.random.Generator) -> States:
-        """Return the starts of as many cases as have plans of about so many steps."""
-        config, count = self._config, max(steps // self._config.plan_steps // self._num_processes, 1)
-        chosen = rng.integers(len(self._cases), size=count)
+    def _starts(self, player: _Player, steps: int, rng: np.random.Generator) -> States:
+        """Return the starts of as many cases as have plans of about the player's share of so many steps."""
+        config, cases = self._config, player.cases
+        teams = sum(each.teams for each in self._players)
+        count = max(steps * player.teams // teams // config.plan_steps // self._num_processes, 1)
+        chosen = rng.integers(len(cases), size=count)
         return States.start_of(
-            [self._cases.instances[case] for case in chosen],
+            [cases.instances[case] for case in chosen],
             config.policy,
-            maps=self._map_of[chosen],
+            maps=cases.map_of[chosen],
             seeds=rng.integers(2**63, size=count).astype(np.uint64),
             limits=config.rollout_length,
         )

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 import experts
 from experts.many import SOLVER_NAMES
+from gnn_policy.cases import Task
 from gnn_policy.config import RobotOrder
 from gnn_policy.demonstrations import Demonstrations
 from gnn_policy.plugins import import_by_name
@@ -54,10 +55,16 @@ class Labeller:
         self.seconds = 0.0
         """Seconds spent in the expert so far."""
 
-    def moves(self, states: States) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
-        """Return the moves (R,) of all robots and which of the T states the expert solved; the others idle."""
+    def moves(self, states: States, task: Task = "one_shot") -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
+        """Return the moves (R,) of all robots and which of the T states the expert solved; the others idle.
+
+        In lifelong tasks the planner with a rolling horizon takes the place of ECBS, whose plans end at goals which
+        change on arrival.
+        """
         if not len(states):
             return np.empty(0, np.int8), np.empty(0, np.bool_)
+        if self._solver == "ecbs" and task == "lifelong":
+            return self._next_moves(states), np.ones(len(states), np.bool_)
         if self._solver != "ecbs":
             plans = self.plans(states)
             moves = np.full(states.num_robots, Action.IDLE, np.int8)
@@ -79,6 +86,14 @@ class Labeller:
         moves[order] = labels
         self.seconds += self._clock() - began
         return moves, solved
+
+    def _next_moves(self, states: States) -> npt.NDArray[np.int8]:
+        began = self._clock()
+        order = self._order(states)
+        moves = np.empty(states.num_robots, np.int8)
+        moves[order] = experts.next_moves(self._instances(states, order), threads=self._threads)
+        self.seconds += self._clock() - began
+        return moves
 
     def plans(self, states: States) -> list[Solution | None]:
         """Return the plan from each of T states, or None where the expert did not solve it.
@@ -186,7 +201,7 @@ class Labeller:
             here = _after(here, actions)
         return Demonstrations.concatenate(parts), int((~labels.solved).sum())
 
-    def label(self, states: States) -> tuple[Demonstrations, int]:
+    def label(self, states: States, task: Task = "one_shot") -> tuple[Demonstrations, int]:
         """Return the given states, in their order, labelled, and how many were not solved.
 
         A state that was visited often counts as often, so states where teams are stuck weigh more; it is solved once.
@@ -200,7 +215,7 @@ class Labeller:
             if which[t] == len(first):
                 first.append(t)
         distinct = states.take(np.array(first, np.intp))
-        moves, solved = self.moves(distinct)
+        moves, solved = self.moves(distinct, task)
         labelled = np.flatnonzero(solved[which])
         return (
             Demonstrations(states.take(labelled), moves[distinct.rows(which[labelled])]),

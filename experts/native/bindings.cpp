@@ -196,15 +196,20 @@ std::pair<Out<std::int8_t>, Out<bool>> relabel(const std::vector<std::pair<GridA
 using LabelParts = std::tuple<Out<std::int64_t>, Out<std::int32_t>, Out<std::int64_t>, Out<std::int32_t>,
                               Out<std::int8_t>, Out<bool>, Out<std::int64_t>, std::vector<int>>;
 
-LabelParts label_plans(const std::vector<InstanceArrays>& instances, int steps, double w, std::size_t node_limit,
-                       int rounds, std::uint64_t seed, int threads) {
-    std::vector<mapf::Team> cases;
-    cases.reserve(instances.size());
+std::vector<mapf::Team> as_teams(const std::vector<InstanceArrays>& instances) {
+    std::vector<mapf::Team> teams;
+    teams.reserve(instances.size());
     for (const auto& [grid, starts, goals] : instances) {
         auto map = as_grid(grid);
         auto from = as_cells(map.layout, starts), to = as_cells(map.layout, goals);
-        cases.push_back({std::move(map), std::move(from), std::move(to)});
+        teams.push_back({std::move(map), std::move(from), std::move(to)});
     }
+    return teams;
+}
+
+LabelParts label_plans(const std::vector<InstanceArrays>& instances, int steps, double w, std::size_t node_limit,
+                       int rounds, std::uint64_t seed, int threads) {
+    const auto cases = as_teams(instances);
     std::vector<mapf::PlanLabels> labels;
     run_without_gil([&](mapf::Interrupt& interrupt) {
         labels = mapf::label_plans(cases, {steps, w, node_limit, rounds, seed}, threads, interrupt);
@@ -245,6 +250,20 @@ LabelParts label_plans(const std::vector<InstanceArrays>& instances, int steps, 
         }
     }
     return {source_array, time_array, offsets_array, positions_array, actions_array, solved_array, cost_array, found_by};
+}
+
+Out<std::int8_t> next_moves(const std::vector<InstanceArrays>& instances, int window, int rounds, std::uint64_t seed,
+                            int threads) {
+    const auto cases = as_teams(instances);
+    std::size_t num_robots = 0;
+    for (const auto& each : cases) num_robots += each.starts.size();
+    auto [move, array] = mapf::make_array<std::int8_t>({num_robots});
+    std::vector<std::vector<std::uint8_t>> found;
+    run_without_gil([&](mapf::Interrupt& interrupt) {
+        found = mapf::next_moves(cases, window, rounds, seed, threads, interrupt);
+    });
+    for (const auto& moves : found) move = std::copy(moves.begin(), moves.end(), move);
+    return array;
 }
 
 // One search in the calling thread: search(problem's grid, starts, goals, budget, outcome).
@@ -381,6 +400,8 @@ NB_MODULE(_native, m) {
           "threads"_a, "First joint action for each state; see experts.relabel.");
     m.def("label_plans", &label_plans, "instances"_a, "steps"_a, "w"_a, "node_limit"_a, "rounds"_a, "seed"_a,
           "threads"_a, "Solves each instance once and labels the states on its plan; see experts.label_plans.");
+    m.def("next_moves", &next_moves, "instances"_a, "window"_a, "rounds"_a, "seed"_a, "threads"_a,
+          "The first joint action of a plan with a rolling horizon for each instance; see experts.next_moves.");
     nb::class_<mapf::RollingHorizon>(m, "RollingHorizon", "Plans a few steps ahead; see experts.RollingHorizon.")
         .def("__init__",
              [](mapf::RollingHorizon* self, const GridArray& grid, int window, int rounds, std::uint64_t seed) {

@@ -6,6 +6,7 @@
 #include "experts/native/ecbs.hpp"
 #include "experts/native/improvement.hpp"
 #include "experts/native/lazy_constraints.hpp"
+#include "experts/native/rolling_horizon.hpp"
 #include "experts/native/work_queue.hpp"
 
 namespace mapf {
@@ -66,6 +67,21 @@ std::vector<PlanLabels> label_plans(std::span<const Team> cases, const LabelOpti
         label(cases[job], options, workspace, budget, labels[job]);
     });
     return labels;
+}
+
+std::vector<std::vector<std::uint8_t>> next_moves(std::span<const Team> cases, int window, int rounds,
+                                                  std::uint64_t seed, int threads, Interrupt& interrupt) {
+    struct Nothing {};
+    std::vector<std::vector<std::uint8_t>> moves(cases.size());
+    run_jobs<Nothing>(cases.size(), threads, interrupt, [&](std::size_t job, Nothing&, bool polls) {
+        const auto& [grid, starts, goals] = cases[job];
+        Budget budget(std::numeric_limits<double>::infinity(), interrupt, polls);
+        RollingHorizon planner(grid, window, rounds, seed);
+        planner.plan(starts, goals, 0, budget);
+        for (std::size_t robot = 0; robot < starts.size(); ++robot)
+            moves[job].push_back(static_cast<std::uint8_t>(planner.action(robot, 0)));
+    });
+    return moves;
 }
 
 }  // namespace mapf

@@ -1,4 +1,5 @@
-// Labels by plan: many states are solved once each, and the first steps of a plan label the states on it.
+// Labels by plan: many states are solved once each, and the first steps of a plan label the states on it. In lifelong
+// tasks goals change where robots arrive, so there only a state itself is labelled.
 #pragma once
 
 #include <cstddef>
@@ -39,5 +40,9 @@ struct PlanLabels {
 // path is too long to be counted.
 std::vector<PlanLabels> label_plans(std::span<const Team> cases, const LabelOptions& options, int threads,
                                     Interrupt& interrupt);
+
+// The first joint action (N) of each case's plan by a new planner with a rolling horizon.
+std::vector<std::vector<std::uint8_t>> next_moves(std::span<const Team> cases, int window, int rounds,
+                                                  std::uint64_t seed, int threads, Interrupt& interrupt);
 
 }  // namespace mapf

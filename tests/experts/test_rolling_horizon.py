@@ -105,3 +105,26 @@ def test_bad_arguments_are_named() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             planner.act(positions, goals)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(strategies.instances(max_side=6, max_agents=8), max_size=4), st.integers(0, 2**64 - 1))
+def test_next_moves_are_those_of_a_planner_for_each_state(instances: list[Instance], seed: int) -> None:
+    moves = experts.next_moves(instances, window=6, rounds=20, seed=seed)
+    expected = [
+        experts.RollingHorizon(each.grid, window=6, rounds=20, seed=seed).act(each.starts, each.goals)
+        for each in instances
+    ]
+    assert moves.tolist() == [move for own in expected for move in own.tolist()]
+    assert moves.dtype == np.int8
+    threaded = experts.next_moves(instances, window=6, rounds=20, seed=seed, threads=3)
+    assert threaded.tolist() == moves.tolist()
+
+
+def test_bad_arguments_of_next_moves_are_named() -> None:
+    instance = random_instance(seed=0)
+    for name in ("window", "rounds", "threads"):
+        with pytest.raises(ValueError, match=name):
+            experts.next_moves([instance], **{name: 0})
+    with pytest.raises(TypeError, match=r"instances\[1\] must be a mapf_env.Instance"):
+        experts.next_moves([instance, 3])  # pyright: ignore[reportArgumentType]

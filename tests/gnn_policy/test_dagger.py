@@ -88,6 +88,10 @@ def collected(config, policy, cases, number, steps):
         demonstrator.close()
 
 
+def of_team(array, states, t):
+    return array[states.offsets[t] : states.offsets[t + 1]]
+
+
 def after(positions, moves):
     return positions + np.array(STEPS)[moves]
 
@@ -485,6 +489,27 @@ def test_teams_of_both_tasks_play_side_by_side(policy, both_tasks):
     played = {task: sum(count for (own, _), count in kinds.items() if own == task) for task in ("one_shot", "lifelong")}
     assert played["lifelong"] == 2 * 40, "two of six teams, as a third of the maps is theirs"
     assert played["one_shot"] > 0
+
+
+@pytest.mark.parametrize("aggregation", ["visited", "plans"])
+@pytest.mark.parametrize("number", [0, 1])
+def test_every_visited_state_of_a_lifelong_task_has_a_rolling_horizon_label(number, aggregation, policy, both_tasks):
+    config = replace(CONFIG, rollout_teams=6, rollout_length=20, plan_steps=4, aggregation=aggregation)
+    demonstrations, unsolved = collected(config, policy, both_tasks, number, 120)
+    found = demonstrations.states
+    lifelong = {int(each) for each in both_tasks.map_of[both_tasks.lifelong]}
+    labelled = 0
+    for t, grid in enumerate(found.maps.tolist()):
+        if grid in lifelong:
+            here, goals, moves = (
+                of_team(each, found, t) for each in (found.positions, found.goals, demonstrations.actions)
+            )
+            planner = experts.RollingHorizon(both_tasks.grids[grid])
+            assert planner.act(here.astype(np.int32), goals.astype(np.int32)).tolist() == moves.tolist()
+            labelled += 1
+    assert labelled == 2 * 20, "two of six teams, as a third of the maps is theirs"
+    assert len(found) > labelled
+    assert unsolved == 0
 
 
 def test_each_collector_has_a_team_for_each_task(policy, both_tasks):
