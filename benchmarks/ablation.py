@@ -68,8 +68,8 @@ JUDGED_AT_THE_END: dict[str, Any] = {"validate_every": BASE.rounds, "validation_
 DAGGER: Variants = {
     DEFAULT: {},
     "none": {"dagger_every": 0},
-    "stuck, as released": {"aggregation": "stuck", "dagger_every": 4, "dagger_steps": 32_768, "fresh_share": 0.0},
-    "stuck, every round": {"aggregation": "stuck", "dagger_steps": 32_768, "fresh_share": 0.0},
+    "failed, every 4th round": {"aggregation": "failed", "dagger_every": 4, "dagger_steps": 32_768, "fresh_share": 0.0},
+    "failed, every round": {"aggregation": "failed", "dagger_steps": 32_768, "fresh_share": 0.0},
     "fresh 0.25": {"fresh_share": 0.25},
     "fresh 0.5": {"fresh_share": 0.5},
     "mining 2": {"hard_case_mining": 2},
@@ -271,7 +271,7 @@ def waiting(solutions: Sequence[Solution]) -> float:
     """The share of waits among all moves before a robot's last arrival."""
     waits = moves = 0
     for solution in solutions:
-        under_way = np.arange(len(solution.paths) - 1)[:, None] < solution.arrivals
+        under_way = np.arange(len(solution.paths) - 1)[:, None] < solution.arrival_times
         waits += int(((np.diff(solution.paths, axis=0) == 0).all(-1) & under_way).sum())
         moves += int(under_way.sum())
     return waits / max(moves, 1)

@@ -34,7 +34,7 @@ from gnn_policy.policy_config import PolicyConfig
 from gnn_policy.precision import autocast, resolved
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.recipes import RECIPES
-from gnn_policy.results_file import refuse_other_settings
+from gnn_policy.results_json import refuse_other_settings
 from gnn_policy.rollout import rollout
 from gnn_policy.run_folder import RunLockedError
 from gnn_policy.training import Training

@@ -31,7 +31,7 @@ import pogema_methods
 from gnn_policy.command_line import run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.metrics import Estimate
-from gnn_policy.results_file import refuse_other_settings
+from gnn_policy.results_json import refuse_other_settings
 from mapf_env import instance_hash
 from mapf_env.files import write_whole
 from pogema_cases import BenchmarkSet, Case, Published, load_published, load_sets

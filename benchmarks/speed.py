@@ -103,16 +103,16 @@ class Competitor:
 
 
 def batched(
-    options: Options, dtype: Dtype = "float32", *, own_memory: bool = False, **settings: Any
+    options: Options, dtype: Dtype = "float32", *, own_buffers: bool = False, **settings: Any
 ) -> Callable[[int], Rates]:
-    """Our `BatchedEnv`, with new observations or in the caller's memory."""
+    """Our `BatchedEnv`, with new observations or in the caller's buffers."""
 
     def measure(num_agents: int) -> Rates:
         num_envs = options.num_envs(num_agents)
         env = mapf_env.BatchedEnv(num_envs, **(options.settings(num_agents, dtype) | settings))
         env.reset(seed=0)
         actions = cycle(np.random.default_rng(0).integers(0, 5, (64, num_envs, num_agents)))
-        out = env.buffers() if own_memory else None
+        out = env.buffers() if own_buffers else None
         return Rates(
             num_envs * num_agents * calls_per_second(lambda: env.step(next(actions), out=out), options.seconds),
             num_envs * calls_per_second(env.reset, options.seconds),
@@ -195,7 +195,7 @@ def threads_table(options: Options, program: Path | None) -> Table:
             rates = [max(rate, turn()) for rate, turn in zip(rates, turns, strict=True)]
         return rates
 
-    result = Table(title="agent-steps per second, best turns, float32, caller's memory", box=box.SIMPLE_HEAD)
+    result = Table(title="agent-steps per second, best turns, float32, caller's buffers", box=box.SIMPLE_HEAD)
     for name in ("", "one thread", "two threads", "ratio"):
         result.add_column(name, justify="right" if name else "left", no_wrap=True)
     for num_agents in options.num_agents:
@@ -237,9 +237,9 @@ def competitors(options: Options, console: Console, program: Path | None) -> lis
     floats, ints = ("bare loop, float32", "bare loop, uint8") if program else ("", "")
     ours = [
         Competitor("BatchedEnv, float32", batched(options), peer, floats),
-        Competitor("float32, caller's memory", batched(options, own_memory=True), peer, floats),
+        Competitor("float32, caller's buffers", batched(options, own_buffers=True), peer, floats),
         Competitor("BatchedEnv, uint8", batched(options, "uint8"), peer, ints),
-        Competitor("uint8, caller's memory", batched(options, "uint8", own_memory=True), peer, ints),
+        Competitor("uint8, caller's buffers", batched(options, "uint8", own_buffers=True), peer, ints),
         Competitor("float32 + cost-to-go", batched(options, extra_channels=("cost_to_go",)), peer),
         Competitor("float32 + PIBT shield", batched(options, shield="pibt"), peer, floats),
         Competitor("float32 + message loss 10%", batched(options, message_loss=0.1), peer, floats),

@@ -40,7 +40,7 @@ def outcome(played: Rehearsal, instance: Instance, without: int | None = None) -
     """Return success and flowtime, if wanted without one robot; a robot that is not on its goal counts T_max."""
     robots = [robot for robot in range(instance.num_agents) if robot != without]
     at_end = (played.solution.paths[-1] == instance.goals).all(axis=1)[robots]
-    times = np.where(at_end, played.solution.arrivals[robots], MAX_STEPS)
+    times = np.where(at_end, played.solution.arrival_times[robots], MAX_STEPS)
     return bool(at_end.all()), int(times.sum())
 
 

@@ -33,7 +33,7 @@ def save_paths(path: PathLike, solution: Solution) -> None:
     """
     arguments.instance_of(solution, Solution, "solution")
     lines = []
-    for agent, arrival in enumerate(solution.arrivals):
+    for agent, arrival in enumerate(solution.arrival_times):
         cells = solution.paths[: arrival + 1, agent].tolist()
         lines.append(f"Agent {agent}: " + "".join(f"({row},{col})->" for row, col in cells))
     write_whole(path, "\n".join([*lines, ""]))

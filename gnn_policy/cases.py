@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnn_policy.settings import check_types
-from mapf_env import Instance, Maze, Rooms, Walls, Warehouse, random_cases, random_maps
+from mapf_env import Instance, Maze, Rooms, Walls, Warehouse, random_maps, random_starts_and_goals
 from mapf_env.arguments import lists_settings
 from mapf_env.generation import MapStyle, Style
 from mapf_env.hashing import mix
@@ -143,11 +143,11 @@ class Cases:
     def by_task(self) -> dict[Task, Cases]:
         """Return the cases of each task that occurs, on the same maps."""
         chosen = {task: np.flatnonzero(self.lifelong == (task == "lifelong")) for task in get_args(Task)}
-        return {task: self._take(cases) for task, cases in chosen.items() if len(cases)}
+        return {task: self._take(numbers) for task, numbers in chosen.items() if len(numbers)}
 
-    def _take(self, cases: npt.NDArray[np.intp]) -> Cases:
-        instances = [self.instances[case] for case in cases]
-        return Cases(instances, self.grids, self.map_of[cases], self.family_of[cases], self.lifelong[cases])
+    def _take(self, numbers: npt.NDArray[np.intp]) -> Cases:
+        instances = [self.instances[number] for number in numbers]
+        return Cases(instances, self.grids, self.map_of[numbers], self.family_of[numbers], self.lifelong[numbers])
 
 
 def make_cases(split: Split, *, seed: int, maps: int, cases_per_map: int, families: Sequence[Family]) -> Cases:
@@ -162,7 +162,9 @@ def make_cases(split: Split, *, seed: int, maps: int, cases_per_map: int, famili
     if not families:
         raise ValueError(f"the {split} split needs at least one family of cases, got none")
     if maps < 1 or cases_per_map < 1:
-        raise ValueError(f"the {split} split needs at least one map and one case a map, got {maps} and {cases_per_map}")
+        raise ValueError(
+            f"the {split} split needs at least one map and one case per map, got {maps} and {cases_per_map}"
+        )
     stream = mix(np.array([seed], np.uint64), np.array([get_args(Split).index(split)], np.uint64))
     map_seeds = mix(np.repeat(stream, maps), np.arange(maps, dtype=np.uint64))
     family_of = _turns(np.array([each.share for each in families]), maps)
@@ -208,14 +210,14 @@ def _place(
     grids: Sequence[npt.NDArray[np.bool_]], map_of: npt.NDArray[np.int32], robots: Sequence[int], seeds: Seeds
 ) -> list[Instance]:
     alike: dict[Hashable, list[int]] = defaultdict(list)
-    for case, (number, count) in enumerate(zip(map_of, robots, strict=True)):
-        alike[grids[number].shape, count].append(case)
+    for number, (own_map, count) in enumerate(zip(map_of, robots, strict=True)):
+        alike[grids[own_map].shape, count].append(number)
     instances: list[Instance | None] = [None] * len(robots)
-    for (_, count), cases in alike.items():  # pyright: ignore[reportGeneralTypeIssues]
-        maps = np.stack([grids[number] for number in map_of[cases]])
-        starts, goals = random_cases(seeds[cases], maps, count)
-        for row, case in enumerate(cases):
-            instances[case] = Instance(grids[map_of[case]], starts[row], goals[row])
+    for (_, count), numbers in alike.items():  # pyright: ignore[reportGeneralTypeIssues]
+        maps = np.stack([grids[own_map] for own_map in map_of[numbers]])
+        starts, goals = random_starts_and_goals(seeds[numbers], maps, count)
+        for row, number in enumerate(numbers):
+            instances[number] = Instance(grids[map_of[number]], starts[row], goals[row])
     return [each for each in instances if each is not None]
 
 

@@ -19,7 +19,7 @@ from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
 RobotOrder = Literal["index", "random", "farthest", "nearest"]
-Aggregation = Literal["visited", "stuck", "plans"]
+Aggregation = Literal["visited", "failed", "plans"]
 Backend = Literal["direct", "process"]
 Precision = Literal["auto", "float32", "bfloat16"]
 Optimizer = Literal["adam", "adamw"]
@@ -99,8 +99,8 @@ class TrainConfig:
     demonstration_steps: int = 524_288
     """Team steps played in round 0, by the expert."""
     aggregation: Aggregation = "visited"
-    """States to aggregate: every "visited" state; plans from where teams are "stuck" at the end of their time, as the
-    authors' code does; or the first steps of "plans" from some of the visited states, which costs the expert least."""
+    """States to aggregate: every "visited" state; plans from where teams that "failed" stood at the end, as in the
+    authors' code; or the first steps of "plans" from some of the visited states, which costs the expert least."""
     plan_steps: int = 24
     """Steps of each plan that are labelled in an aggregation of "plans"."""
     stuck_weight: float = 1.0

@@ -1,8 +1,8 @@
 """Dataset aggregation: play a mixture of expert and policy, and ask the expert about the states that are visited.
 
 Source: Ross, Gordon and Bagnell 2011 (DAgger). What matters there holds here: the states come from the mixture, the
-labels from the expert alone, and the data of all rounds are kept. The variant that asks only where teams are stuck is
-that of the paper's released code.
+labels from the expert alone, and the data of all rounds are kept. The variant that asks only where teams failed is
+that of the authors' code.
 """
 
 from __future__ import annotations
@@ -179,10 +179,10 @@ class _Player:
         )
         self._batches: Iterator[TensorDictBase] = iter(self._collector)
 
-    def play(self, beta: float, seed: int, times: int, mining: int, *, only_stuck: bool) -> States:
+    def play(self, beta: float, seed: int, times: int, mining: int, *, only_failed: bool) -> States:
         """Play the teams `times` times for each one that is kept, and return the states of those.
 
-        With `mining` above 1 the one in so many is kept that arrived last. With `only_stuck` only the last states of
+        With `mining` above 1 the one in so many is kept that arrived last. With `only_failed` only the last states of
         teams that did not arrive are returned.
         """
         self._mixture.begin(beta, seed)
@@ -198,7 +198,7 @@ class _Player:
         arrived = np.asarray(played["next", "terminated"]).reshape(len(played), -1).any(axis=1)
         teams = np.sort(arrived.argsort(kind="stable")[: len(played) // mining])
         chosen = played[torch.from_numpy(teams)].reshape(-1)
-        if only_stuck:
+        if only_failed:
             chosen = chosen[chosen["next", "truncated"][:, 0]]
         return states_of(chosen, self.cases.map_of)
 
@@ -230,13 +230,13 @@ class Demonstrator:
         The demonstrations of a round depend on its number, the process's number and the weights.
 
         Returns:
-            The demonstrations of all states of the round, or of plans from where teams were stuck, and the number of
+            The demonstrations of all states of the round, or of plans from where teams failed, and the number of
             states that the expert could not solve.
         """
         config = self._config
         seed = int(np.random.SeedSequence([config.seed, round_number, self._rank]).generate_state(1)[0])
         demonstrated = round_number == 0
-        aggregation = "visited" if demonstrated and config.aggregation == "stuck" else config.aggregation
+        aggregation = "visited" if demonstrated and config.aggregation == "failed" else config.aggregation
         beta, mining = config.beta_decay**round_number, 1 if demonstrated else config.hard_case_mining
         times = -(-steps // (config.rollout_teams * config.rollout_length))
         labelled = []
@@ -245,13 +245,13 @@ class Demonstrator:
                 starts = self._starts(player, steps, np.random.default_rng(seed))
                 labelled.append(self._labeller.demonstrate(starts, config.plan_steps))
                 continue
-            states = player.play(beta, seed, times, mining, only_stuck=aggregation == "stuck")
+            states = player.play(beta, seed, times, mining, only_failed=aggregation == "failed")
             labelled.append(self._label(states, player.task, aggregation, seed))
         return Demonstrations.concatenate([part for part, _ in labelled]), sum(count for _, count in labelled)
 
     def _label(self, states: States, task: Task, aggregation: Aggregation, seed: int) -> tuple[Demonstrations, int]:
         config = self._config
-        if aggregation == "stuck":
+        if aggregation == "failed":
             return self._labeller.demonstrate(states)
         if aggregation == "visited" or task == "lifelong":
             return self._labeller.label(states, task)

@@ -16,7 +16,7 @@ from gnn_policy.cases import Task
 from gnn_policy.command_line import parse_options, run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.execution import Execution
-from gnn_policy.results_file import default_executions, refuse_other_settings, settings_of
+from gnn_policy.results_json import default_executions, refuse_other_settings, settings_of
 from mapf_env.generation import MapStyle
 
 PROG = "python -m gnn_policy.evaluate"
@@ -132,7 +132,7 @@ def _evaluate(command: Command) -> None:
     import torch
 
     from gnn_policy.command_line import on_device
-    from gnn_policy.evaluation_report import evaluate_and_report
+    from gnn_policy.evaluation_tables import evaluate_and_report
 
     torch.set_num_threads(threads)
     policy = on_device(checkpoint.load(command.policy, plugins=command.plugins), command.device)

@@ -72,7 +72,7 @@ def _cut_off(
 
 def count_failures(played: Rollouts) -> dict[Failure, int]:
     """Count the played cases by kind of failure."""
-    found = Counter(failure(*case) for case in zip(played.instances, played.solutions, strict=True))
+    found = Counter(map(failure, played.instances, played.solutions))
     return {kind: found[kind] for kind in get_args(Failure) if found[kind]}
 
 
@@ -82,21 +82,24 @@ def worst(played: Rollouts, expert: Sequence[Solution], count: int) -> list[Scen
     A case is worse than another if it failed and the other did not, then if more robots are off their goals, then if
     its flowtime exceeds the expert's by more.
     """
-    cases = list(zip(played.instances, played.solutions, strict=True))
-    kinds = [failure(*case) for case in cases]
-    off_goal = [int((solution.paths[-1] != instance.goals).any(axis=1).sum()) for instance, solution in cases]
+    instances, solutions = played.instances, played.solutions
+    kinds = list(map(failure, instances, solutions))
+    off_goal = [
+        int((solution.paths[-1] != instance.goals).any(axis=1).sum())
+        for instance, solution in zip(instances, solutions, strict=True)
+    ]
     costs = np.array([each.sum_of_costs for each in expert])
     increase = (played.flowtime - costs) / np.maximum(costs, 1)
-    order = [int(case) for case in np.lexsort([-increase, -np.array(off_goal)])]
-    examples = {next(case for case in order if kinds[case] == kind) for kind in set(kinds) - {None}}
-    order.sort(key=lambda case: case not in examples)
+    order = [int(number) for number in np.lexsort([-increase, -np.array(off_goal)])]
+    examples = {next(number for number in order if kinds[number] == kind) for kind in set(kinds) - {None}}
+    order.sort(key=lambda number: number not in examples)
     return [
         Scene(
-            f"{cases[case][0].num_agents} robots, case {case}: "
-            + (f"{kinds[case]}, {off_goal[case]} not on goal" if kinds[case] else "solved")
-            + f", flowtime {increase[case]:+.0%}",
-            cases[case][0],
-            {"policy": cases[case][1], "expert": expert[case]},
+            f"{instances[number].num_agents} robots, case {number}: "
+            + (f"{kinds[number]}, {off_goal[number]} not on goal" if kinds[number] else "solved")
+            + f", flowtime {increase[number]:+.0%}",
+            instances[number],
+            {"policy": solutions[number], "expert": expert[number]},
         )
-        for case in order[:count]
+        for number in order[:count]
     ]

@@ -204,7 +204,8 @@ class Labeller:
     def label(self, states: States, task: Task = "one_shot") -> tuple[Demonstrations, int]:
         """Return the given states, in their order, labelled, and how many were not solved.
 
-        A state that was visited often counts as often, so states where teams are stuck weigh more; it is solved once.
+        A state that was visited often counts as often, so states where teams make no progress weigh more; it is solved
+        once.
         """
         numbers: dict[tuple[int, bytes, bytes], int] = {}
         first, which = [], np.empty(len(states), np.intp)

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from rich import box
-from rich.table import Table
 
 import experts
 from gnn_policy.baselines import GreedyActor, RandomActor
@@ -133,7 +131,7 @@ class Score:
     makespan: Estimate
     """Over solved cases, in steps."""
     latched: float
-    """Share of cases in which every robot touched its goal at least once (the released code's success)."""
+    """Share of cases in which every robot touched its goal at least once (the success of the authors' code)."""
 
 
 def score(name: str, reference: ReferenceSet, rollouts: Rollouts) -> Score:
@@ -252,37 +250,6 @@ def _throughput(name: str, played: Rollouts) -> dict[str, Any]:
     return {"name": name, "throughput": _finite(asdict(Estimate.average(played.throughput)))}
 
 
-def lifelong_table(title: str, result: dict[str, Any]) -> Table:
-    """Return what `compare_lifelong` returns as a table for the terminal."""
-    caption = f"{result['cases']} cases of {result['steps']} steps, 95 % intervals; * knows the whole map"
-    shown = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
-    shown.add_column("", overflow="fold")
-    shown.add_column("arrivals\nper step", justify="right", no_wrap=True)
-    for row in result["rows"]:
-        mean, high = row["throughput"]["mean"], row["throughput"]["high"]
-        shown.add_row(row["name"], f"{mean:.3f}" + ("" if high is None else f" ±{high - mean:.3f}"))
-    return shown
-
-
-def table(title: str, result: dict[str, Any]) -> Table:
-    """Return what `as_json` returns as a table for the terminal, at most 80 columns wide."""
-    shown = Table(title=title, caption=_caption(result), box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
-    shown.add_column("", overflow="fold")
-    for heading in ("success rate", "flowtime\nincrease", "of solved\ncases", "make-\nspan", "lat-\nched"):
-        shown.add_column(heading, justify="right", no_wrap=True)
-    for row in result["rows"]:
-        rate, makespan = row["success_rate"], row["makespan"]["mean"]
-        shown.add_row(
-            row["name"],
-            f"{rate['mean']:.3f} \\[{rate['low']:.3f}, {rate['high']:.3f}]",
-            _percent(row["flowtime_increase"]),
-            _percent(row["flowtime_increase_solved"]),
-            "-" if makespan is None else f"{makespan:.1f}",
-            f"{row['latched']:.3f}",
-        )
-    return shown
-
-
 def as_json(rows: Sequence[Score], reference: ReferenceSet) -> dict[str, Any]:
     """Return the rows as plain data, with null for numbers that are not finite."""
     plain = [_finite(asdict(row)) for row in rows]
@@ -303,21 +270,3 @@ def _finite(value: Any) -> Any:
 def _over_bound(reference: ReferenceSet) -> float:
     """Return the expert's flowtime divided by its lower bound, as a mean over the cases."""
     return float((np.maximum(reference.flowtimes, 1) / np.maximum(reference.lower_bounds, 1)).mean())
-
-
-def _caption(result: dict[str, Any]) -> str:
-    lines = [
-        f"{result['cases']} cases, 95 % intervals; T_max follows from the expert's makespan",
-        f"the expert's flowtime is {result['expert_over_bound']:.4f} x its lower bound",
-        "stuck: stuck robots sample their moves; * knows the whole map",
-    ]
-    if result["unsolved_by_expert"]:
-        lines.append(f"{result['unsolved_by_expert']} more cases are left out: the expert did not solve them")
-    return "\n".join(lines)
-
-
-def _percent(estimate: dict[str, float | None]) -> str:
-    mean, high = estimate["mean"], estimate["high"]
-    if mean is None:
-        return "-"
-    return f"{mean:+.1%}" + ("" if high is None else f" ±{100 * (high - mean):.1f}")

@@ -274,7 +274,7 @@ def _summarise(instances: list[Instance], played: list[_Played], limits: npt.NDA
     success, flowtime, makespan, share, latched = [], [], [], [], []
     for run, solution, limit in zip(played, solutions, limits, strict=True):
         on_goal = (run.paths == run.goals).all(axis=2)
-        times = np.where(on_goal[-1] & (task == "one_shot"), solution.arrivals, limit)
+        times = np.where(on_goal[-1] & (task == "one_shot"), solution.arrival_times, limit)
         success.append(on_goal[-1].all() and task == "one_shot")
         flowtime.append(times.sum())
         makespan.append(times.max())

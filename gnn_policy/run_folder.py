@@ -7,7 +7,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from gnn_policy.config import TrainConfig
-from gnn_policy.results_file import read_tables, tables_of
+from gnn_policy.results_json import read_tables, tables_of
 from mapf_env.files import remove_drafts
 
 RESULTS = "results.json"

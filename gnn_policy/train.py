@@ -17,7 +17,7 @@ from gnn_policy.command_line import parse_options, run_command
 from gnn_policy.config import TrainConfig
 from gnn_policy.cores import cpu_threads
 from gnn_policy.recipes import RECIPES, Recipe
-from gnn_policy.results_file import default_executions, read_tables, settings_of, table_title, tables_of
+from gnn_policy.results_json import default_executions, read_tables, settings_of, table_title, tables_of
 from gnn_policy.run_folder import RESULTS, check_run, is_finished
 
 if TYPE_CHECKING:
@@ -109,12 +109,12 @@ def _start(command: Command) -> None:
 
 
 def _show_finished(folder: Path, config: TrainConfig) -> None:
-    from gnn_policy.metrics import lifelong_table, table
+    from gnn_policy.evaluation_tables import lifelong_table, success_table
 
     console, settings = Console(), settings_of(config, (), default_executions(config.execution), "test")
     shown = tables_of(config, ())
     for name, result in read_tables(folder / RESULTS).items():
-        show = lifelong_table if shown[name].tasks == {"lifelong"} else table
+        show = lifelong_table if shown[name].tasks == {"lifelong"} else success_table
         console.print(show(table_title(name, settings), result))
     console.print(
         f"{folder} holds a finished run: choose another folder with --run to train again",
@@ -125,7 +125,7 @@ def _show_finished(folder: Path, config: TrainConfig) -> None:
 
 def _train(config: TrainConfig, folder: Path, console: Console, process: Process) -> None:
     from gnn_policy.command_line import on_device
-    from gnn_policy.evaluation_report import evaluate_and_report
+    from gnn_policy.evaluation_tables import evaluate_and_report
     from gnn_policy.progress import TrainingProgress
     from gnn_policy.training import Training
 

@@ -16,7 +16,16 @@ import pettingzoo
 from mapf_env.ascii_map import parse_instance, parse_map
 from mapf_env.batched_env import BatchedEnv, Observation, Step
 from mapf_env.config import EnvConfig, Shield
-from mapf_env.generation import Maze, Rooms, Walls, Warehouse, random_cases, random_instance, random_map, random_maps
+from mapf_env.generation import (
+    Maze,
+    Rooms,
+    Walls,
+    Warehouse,
+    random_instance,
+    random_map,
+    random_maps,
+    random_starts_and_goals,
+)
 from mapf_env.grid_v0 import ENV_ID, GridEnv, env, parallel_env
 from mapf_env.instance import Instance
 from mapf_env.instance_set import instance_hash, load_instances, save_instances
@@ -77,10 +86,10 @@ __all__ = [
     "parse_map",
     "parse_pogema_map",
     "perceive",
-    "random_cases",
     "random_instance",
     "random_map",
     "random_maps",
+    "random_starts_and_goals",
     "replay",
     "replay_scenes",
     "save_instances",

@@ -130,7 +130,7 @@ def random_maps(
     return _native.random_maps(_as_seeds(seeds), height, width, obstacles, number, **parts)
 
 
-def random_cases(
+def random_starts_and_goals(
     seeds: npt.ArrayLike, grids: npt.NDArray[np.bool_], num_agents: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
     """Return starts and goals, each (B, N, 2), for each of B seeds on its grid of `grids` (B, H, W).
@@ -178,7 +178,7 @@ def random_instance(
         grids = random_maps(seeds, height=height, width=width, density=density, style=style)
     else:
         grids = as_obstacles(grid)[None]
-    starts, goals = random_cases(seeds, grids, num_agents)
+    starts, goals = random_starts_and_goals(seeds, grids, num_agents)
     return Instance(grids[0], starts[0], goals[0])
 
 

@@ -88,7 +88,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self._reused: _Reused | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_reused": None}  # its dictionaries share the memory of its arrays
+        return self.__dict__ | {"_reused": None}  # its dictionaries share its arrays
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the observation space of an agent; the same object at every call.
@@ -170,10 +170,10 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         self._batch = begun(self._batch, self.config, seed, instance, buffers)
         self.agents = list(self.possible_agents)
         if reused is None:
-            observations, infos, memory = self._fresh(buffers)
+            observations, infos, agent_buffers = self._fresh(buffers)
         else:
-            (observations, *_, infos), memory = reused.returned, reused.memory
-        self._batch.stepper.outcome_by_agent(memory, self.agents, {}, {}, {}, infos)
+            (observations, *_, infos), agent_buffers = reused.returned, reused.agent_buffers
+        self._batch.stepper.outcome_by_agent(agent_buffers, self.agents, {}, {}, {}, infos)
         if self.render_mode == "human":
             self.render()
         return observations, infos
@@ -198,17 +198,17 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         batch, reused = self._batch, self._reused
         if reused is None:
             buffers = batch.buffers()
-            observations, infos, memory = self._fresh(buffers)
+            observations, infos, agent_buffers = self._fresh(buffers)
             rewards, terminated, truncated = {}, {}, {}
         else:
-            buffers, memory = reused.buffers, reused.memory
+            buffers, agent_buffers = reused.buffers, reused.agent_buffers
             observations, rewards, terminated, truncated, infos = reused.returned
         stepper, ended = batch.stepper, None
         if not self._preferences:
-            ended = stepper.step_agents(actions, memory, agents, rewards, terminated, truncated, infos)
+            ended = stepper.step_agents(actions, agent_buffers, agents, rewards, terminated, truncated, infos)
         if ended is None:
             batch.advance(arguments.numbers([self._checked(actions)], "actions"), buffers)
-            ended = stepper.outcome_by_agent(memory, agents, rewards, terminated, truncated, infos)
+            ended = stepper.outcome_by_agent(agent_buffers, agents, rewards, terminated, truncated, infos)
         if ended:
             self.agents = []
         if self.render_mode == "human":
@@ -229,7 +229,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
     def _fresh(self, buffers: Observation) -> tuple[dict[str, Any], dict[str, Any], Any]:
         """Return observations and infos by agent, whose arrays are rows of the buffers (1, N, ...) and of masks (N, 5).
 
-        The third part has the same arrays as memory for the stepper, in its dtype.
+        The third part has the same arrays as buffers of the stepper, in its dtype.
         """
         agents, rows = self.possible_agents, _native.rows_by_agent
         masks = np.empty(self._masks_shape, np.int8)
@@ -242,7 +242,7 @@ class GridEnv(pettingzoo.ParallelEnv[str, Any, Any]):
         return (
             rows(agents, names, columns),
             rows(agents, ("action_mask",), (masks,)),
-            self._batch.stepper.memory(buffers, masks),
+            self._batch.stepper.agent_buffers(buffers, masks),
         )
 
     def _checked(self, actions: dict[str, Any]) -> list[Any]:
@@ -260,7 +260,7 @@ class _Reused:
 
     def __init__(self, env: GridEnv) -> None:
         self.buffers = env._batch.buffers()
-        observations, infos, self.memory = env._fresh(self.buffers)
+        observations, infos, self.agent_buffers = env._fresh(self.buffers)
         self.returned: tuple[dict[str, Any], ...] = (observations, {}, {}, {}, infos)
 
 

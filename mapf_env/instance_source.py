@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mapf_env import _native, arguments
 from mapf_env.config import EnvConfig
-from mapf_env.generation import random_cases, random_maps
+from mapf_env.generation import random_maps, random_starts_and_goals
 from mapf_env.instance import Instance, as_obstacles
 
 
@@ -63,7 +63,7 @@ class InstanceSource:
                 grids = random_maps(seeds, **size, density=config.density, style=config.style)
             else:
                 grids = np.repeat(self._grid[None], count, axis=0)
-            starts, goals = random_cases(seeds, grids, config.num_agents)
+            starts, goals = random_starts_and_goals(seeds, grids, config.num_agents)
             return Problems(grids, starts, goals, np.full(count, config.num_agents, np.int32))
         draws = _native.mix(seeds, np.full_like(seeds, np.iinfo(np.uint64).max)) % np.uint64(len(self._cases))
         return self.stack([self._cases[i] for i in draws.tolist()], "cases")

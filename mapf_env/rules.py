@@ -83,7 +83,7 @@ def communication_graph(
     """Return link weights (B, N, N), or (N, N) for positions (N, 2); `radius` is one number or one for each team.
 
     Two different robots closer than `radius` cells (Euclidean, strictly, as in the authors' code) hear each other:
-    their weight is 1, or with `weights="distance"` 1 / distance; all others are 0. `out` is memory (B, N, N) to write
+    their weight is 1, or with `weights="distance"` 1 / distance; all others are 0. `out` is a buffer (B, N, N) to write
     them into, for positions (B, N, 2).
     """
     arguments.choice(weights, get_args(CommWeights), "weights")
@@ -108,7 +108,7 @@ def communication_graph(
 def connecting_radius(positions: npt.ArrayLike, radius: float) -> float:
     """Return the least radius * 1.1^k, k = 0, 1, ..., that connects all robots at `positions` (N, 2).
 
-    Source: the code of Li et al. 2020, which grows the radius in this way at the start of each case and then keeps it.
+    Source: the code of Li et al. 2020, which grows the radius in this way at the start of each episode and then keeps it.
     """
     return _native.connecting_radius(arguments.cells(positions, "positions", "(N, 2)"), radius)
 

@@ -74,7 +74,7 @@ class Solution:
         return Solution, (self.paths,)
 
     @property
-    def arrivals(self) -> npt.NDArray[np.int64]:
+    def arrival_times(self) -> npt.NDArray[np.int64]:
         """(N,) the time from which each robot stays on its last cell; a goal that is left again does not count."""
         elsewhere = (self.paths != self.paths[-1]).any(axis=2)
         steps = np.arange(1, len(self.paths) + 1)[:, None]
@@ -83,12 +83,12 @@ class Solution:
     @property
     def sum_of_costs(self) -> int:
         """The flowtime: the sum of all arrival times."""
-        return int(self.arrivals.sum())
+        return int(self.arrival_times.sum())
 
     @property
     def makespan(self) -> int:
         """The time of the last arrival."""
-        return int(self.arrivals.max())
+        return int(self.arrival_times.max())
 
     @property
     def actions(self) -> npt.NDArray[np.int8]:

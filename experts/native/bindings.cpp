@@ -105,9 +105,9 @@ void write_plan(const mapf::Layout& layout, const std::vector<int>& starts, cons
     int makespan = 0;
     outcome.cost = 0;
     for (std::size_t robot = 0; robot < starts.size(); ++robot) {
-        const auto arrival = static_cast<int>(plan.actions(robot).size());
-        makespan = std::max(makespan, arrival);
-        outcome.cost += arrival;
+        const auto arrival_time = static_cast<int>(plan.actions(robot).size());
+        makespan = std::max(makespan, arrival_time);
+        outcome.cost += arrival_time;
     }
     outcome.paths = write_paths(layout, starts, makespan, [&](std::size_t robot, int time) {
         const auto actions = plan.actions(robot);
@@ -209,29 +209,29 @@ std::vector<mapf::Team> as_teams(const std::vector<InstanceArrays>& instances) {
 
 LabelParts label_plans(const std::vector<InstanceArrays>& instances, int steps, double w, std::size_t node_limit,
                        int rounds, std::uint64_t seed, int threads) {
-    const auto cases = as_teams(instances);
+    const auto teams = as_teams(instances);
     std::vector<mapf::PlanLabels> labels;
     run_without_gil([&](mapf::Interrupt& interrupt) {
-        labels = mapf::label_plans(cases, {steps, w, node_limit, rounds, seed}, threads, interrupt);
+        labels = mapf::label_plans(teams, {steps, w, node_limit, rounds, seed}, threads, interrupt);
     });
     std::size_t num_states = 0, num_robots = 0;
-    for (std::size_t i = 0; i < cases.size(); ++i) {
+    for (std::size_t i = 0; i < teams.size(); ++i) {
         num_states += static_cast<std::size_t>(labels[i].steps);
-        num_robots += static_cast<std::size_t>(labels[i].steps) * cases[i].starts.size();
+        num_robots += static_cast<std::size_t>(labels[i].steps) * teams[i].starts.size();
     }
     auto [source, source_array] = mapf::make_array<std::int64_t>({num_states});
     auto [time, time_array] = mapf::make_array<std::int32_t>({num_states});
     auto [offset, offsets_array] = mapf::make_array<std::int64_t>({num_states + 1});
     auto [position, positions_array] = mapf::make_array<std::int32_t>({num_robots, 2});
     auto [action, actions_array] = mapf::make_array<std::int8_t>({num_robots});
-    auto [solved, solved_array] = mapf::make_array<bool>({cases.size()});
-    auto [cost, cost_array] = mapf::make_array<std::int64_t>({cases.size()});
+    auto [solved, solved_array] = mapf::make_array<bool>({teams.size()});
+    auto [cost, cost_array] = mapf::make_array<std::int64_t>({teams.size()});
     std::vector<int> found_by;
     *offset = 0;
-    for (std::size_t i = 0; i < cases.size(); ++i) {
-        const auto& layout = cases[i].grid.layout;
+    for (std::size_t i = 0; i < teams.size(); ++i) {
+        const auto& layout = teams[i].grid.layout;
         const auto directions = layout.steps();
-        auto cells = cases[i].starts;
+        auto cells = teams[i].starts;
         auto next = labels[i].actions.begin();
         solved[i] = labels[i].found_by != mapf::FoundBy::none;
         cost[i] = labels[i].cost;
@@ -254,7 +254,7 @@ LabelParts label_plans(const std::vector<InstanceArrays>& instances, int steps, 
 
 Out<std::int8_t> next_moves(const std::vector<InstanceArrays>& instances, int window, int rounds, std::uint64_t seed,
                             int threads) {
-    const auto cases = as_teams(instances);
+    const auto teams = as_teams(instances);
     std::size_t num_robots = 0;
     for (const auto& each : cases) num_robots += each.starts.size();
     auto [move, array] = mapf::make_array<std::int8_t>({num_robots});
@@ -297,7 +297,7 @@ ResultParts pibt(const GridArray& grids, const CellsArray& start_cells, const Ce
         outcome.status = run.solved ? mapf::Status::solved : mapf::Status::step_limit;
         if (!run.solved) return;
         outcome.found_by = mapf::FoundBy::pibt;
-        outcome.cost = std::accumulate(run.arrivals.begin(), run.arrivals.end(), std::int64_t{0});
+        outcome.cost = std::accumulate(run.arrival_times.begin(), run.arrival_times.end(), std::int64_t{0});
         outcome.paths = write_paths(grid.layout, starts, steps, [&](std::size_t robot, int time) {
             return run.actions[static_cast<std::size_t>(time - 1) * num_robots + robot];
         });

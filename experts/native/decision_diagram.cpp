@@ -140,8 +140,8 @@ void DiagramBuilder::prune(DecisionDiagram& diagram) {
 int DiagramBuilder::best_path(const DecisionDiagram& diagram, const Traffic& traffic,
                               std::vector<std::uint8_t>& actions) {
     constexpr int unvisited = std::numeric_limits<int>::max();
-    arrivals_.assign(diagram.nodes.size(), {unvisited, -1, 0});
-    arrivals_[0].conflicts = 0;
+    reached_.assign(diagram.nodes.size(), {unvisited, -1, 0});
+    reached_[0].conflicts = 0;
     for (int time = 0; time < diagram.length; ++time)
         for (int id = diagram.level[time]; id < diagram.level[time + 1]; ++id) {
             const auto& node = diagram.nodes[id];
@@ -150,19 +150,19 @@ int DiagramBuilder::best_path(const DecisionDiagram& diagram, const Traffic& tra
                 const int next = node.next[action];
                 if (next < 0) continue;
                 const int cell = diagram.nodes[next].cell;
-                const int conflicts = arrivals_[id].conflicts +
+                const int conflicts = reached_[id].conflicts +
                                       (action == idle ? 0 : here.by_move[reversed(action)]) +
                                       traffic.vertex_conflicts(traffic.at(cell, time + 1), cell, time + 1);
-                if (conflicts < arrivals_[next].conflicts)
-                    arrivals_[next] = {conflicts, id, static_cast<std::uint8_t>(action)};
+                if (conflicts < reached_[next].conflicts)
+                    reached_[next] = {conflicts, id, static_cast<std::uint8_t>(action)};
             }
         }
     int id = static_cast<int>(diagram.nodes.size()) - 1;  // the goal
-    const int found = arrivals_[id].conflicts + traffic.visits_after(diagram.nodes[id].cell, diagram.length);
+    const int found = reached_[id].conflicts + traffic.visits_after(diagram.nodes[id].cell, diagram.length);
     actions.resize(static_cast<std::size_t>(diagram.length));
     for (int time = diagram.length; time > 0; --time) {
-        actions[time - 1] = arrivals_[id].action;
-        id = arrivals_[id].parent;
+        actions[time - 1] = reached_[id].action;
+        id = reached_[id].parent;
     }
     return found;
 }

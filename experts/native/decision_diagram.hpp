@@ -94,11 +94,11 @@ private:
     std::vector<int> closed_from_;     // forever, where a cell is not closed
     std::vector<int> index_of_;        // in the next level, for each cell
     std::vector<int> new_index_, frontier_, next_frontier_, reached_at_;
-    struct Arrival {
+    struct Reached {
         int conflicts, parent;
         std::uint8_t action;
     };
-    std::vector<Arrival> arrivals_;
+    std::vector<Reached> reached_;
 };
 
 // Finds out if two diagrams have a compatible pair of paths. After many joint states it gives up and returns true,

@@ -204,7 +204,7 @@ Status Ecbs::end_at(Status limit, double w) {
 bool Ecbs::replan_root(Node& root, Budget& budget) {
     for (const int robot : order_) {
         const auto old_path = view(robot, loaded_[robot]);
-        const int conflicts = traffic_.conflicts(old_path) - old_path.arrival();  // it meets itself at every step
+        const int conflicts = traffic_.conflicts(old_path) - old_path.arrival_time();  // it meets itself at every step
         if (conflicts == 0) continue;
         traffic_.remove(old_path);
         if (!search_.run(problem_->grid.layout, traffic_, journey(robot, 0), budget)) return false;
@@ -316,7 +316,7 @@ std::optional<Ecbs::Node> Ecbs::replan(int id, const Constraint& constraint, Bud
     if (!found) return std::nullopt;
     child.parent = id;
     child.robot = robot;
-    child.cost += static_cast<int>(search_.actions().size()) - old_path.arrival();
+    child.cost += static_cast<int>(search_.actions().size()) - old_path.arrival_time();
     child.conflicts += search_.conflicts();
     child.constraint = constraint;
     child.path = store(search_.actions());

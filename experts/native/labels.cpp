@@ -23,9 +23,9 @@ struct Workspace {
 template <class Plan>
 void write(const Plan& plan, std::size_t robots, int steps, PlanLabels& labels) {
     for (std::size_t robot = 0; robot < robots; ++robot) {
-        const auto arrival = static_cast<int>(plan.actions(robot).size());
-        labels.makespan = std::max(labels.makespan, arrival);
-        labels.cost += arrival;
+        const auto arrival_time = static_cast<int>(plan.actions(robot).size());
+        labels.makespan = std::max(labels.makespan, arrival_time);
+        labels.cost += arrival_time;
     }
     labels.steps = std::min(steps, labels.makespan);
     labels.actions.assign(static_cast<std::size_t>(labels.steps) * robots, static_cast<std::uint8_t>(idle));
@@ -59,12 +59,12 @@ void label(const Team& team, const LabelOptions& options, Workspace& workspace, 
 
 }  // namespace
 
-std::vector<PlanLabels> label_plans(std::span<const Team> cases, const LabelOptions& options, int threads,
+std::vector<PlanLabels> label_plans(std::span<const Team> teams, const LabelOptions& options, int threads,
                                     Interrupt& interrupt) {
-    std::vector<PlanLabels> labels(cases.size());
-    run_jobs<Workspace>(cases.size(), threads, interrupt, [&](std::size_t job, Workspace& workspace, bool polls) {
+    std::vector<PlanLabels> labels(teams.size());
+    run_jobs<Workspace>(teams.size(), threads, interrupt, [&](std::size_t job, Workspace& workspace, bool polls) {
         Budget budget(std::numeric_limits<double>::infinity(), interrupt, polls);
-        label(cases[job], options, workspace, budget, labels[job]);
+        label(teams[job], options, workspace, budget, labels[job]);
     });
     return labels;
 }

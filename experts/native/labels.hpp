@@ -27,7 +27,7 @@ struct LabelOptions {
     std::uint64_t seed;
 };
 
-// The plan of a case: its first joint actions (steps, N), empty if there is no plan.
+// The plan of a team: its first joint actions (steps, N), empty if there is no plan.
 struct PlanLabels {
     FoundBy found_by = FoundBy::none;
     std::int64_t cost = 0;
@@ -36,9 +36,9 @@ struct PlanLabels {
     std::vector<std::uint8_t> actions;
 };
 
-// One result for each case. No clock decides, so results depend on the arguments only. Throws std::invalid_argument if a
+// One result for each team. No clock decides, so results depend on the arguments only. Throws std::invalid_argument if a
 // path is too long to be counted.
-std::vector<PlanLabels> label_plans(std::span<const Team> cases, const LabelOptions& options, int threads,
+std::vector<PlanLabels> label_plans(std::span<const Team> teams, const LabelOptions& options, int threads,
                                     Interrupt& interrupt);
 
 // The first joint action (N) of each case's plan by a new planner with a rolling horizon.

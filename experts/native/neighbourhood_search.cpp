@@ -65,7 +65,7 @@ void NeighbourhoodSearch::choose_meeting_robots() {
     random_.shuffle_front(partners, static_cast<int>(partners.size()));
     for (const int partner : partners) choose(partner);
     for (std::size_t i = 0; i < chosen_.size() && chosen_.size() < size_; ++i)
-        wander(chosen_[i], random_.below(arrival(chosen_[i]) + 1));
+        wander(chosen_[i], random_.below(arrival_time(chosen_[i]) + 1));
 }
 
 // One of the most delayed of a few robots, and whom it meets where it would gain time.
@@ -80,7 +80,7 @@ void NeighbourhoodSearch::choose_delayed_robot_and_blockers() {
     if (delay(first) == 0) return;
     choose(first);
     for (int walk = 0; walk < 10 && chosen_.size() < size_; ++walk)
-        wander(chosen_[random_.below(static_cast<int>(chosen_.size()))], random_.below(arrival(first)));
+        wander(chosen_[random_.below(static_cast<int>(chosen_.size()))], random_.below(arrival_time(first)));
 }
 
 bool NeighbourhoodSearch::choose(int robot) {
@@ -95,8 +95,8 @@ bool NeighbourhoodSearch::choose(int robot) {
 void NeighbourhoodSearch::wander(int robot, int time) {
     const auto steps = problem_->grid.layout.steps();
     const auto* distance = problem_->distances.to_goal_of(robot);
-    const int latest = feasible() ? arrival(robot) - 1 : arrival(robot) + 2;
-    time = std::min(time, arrival(robot));
+    const int latest = feasible() ? arrival_time(robot) - 1 : arrival_time(robot) + 2;
+    time = std::min(time, arrival_time(robot));
     int cell = problem_->starts[robot];
     for (int step = 0; step < time; ++step) cell += steps[plan_[robot][step]];
     for (; time < latest && chosen_.size() < size_; ++time) {
@@ -133,7 +133,7 @@ void NeighbourhoodSearch::replan(Budget& budget) {
         least -= distance(robot);
         const auto latest = mending ? forever : static_cast<int>(std::min<std::int64_t>(cost_before - least, forever));
         if (!plan(robot, mending ? forever : 0, latest, budget)) break;
-        least += arrival(robot);
+        least += arrival_time(robot);
         insert(chosen_[planned]);
         if (mending ? meeting_pairs_ > pairs_before : cost_ > cost_before) {
             ++planned;
@@ -166,7 +166,7 @@ void NeighbourhoodSearch::insert(int robot) {
         ++meeting_pairs_;
     });
     reservations_.add(robot, view(robot));
-    cost_ += arrival(robot);
+    cost_ += arrival_time(robot);
 }
 
 void NeighbourhoodSearch::take_out(int robot) {
@@ -177,7 +177,7 @@ void NeighbourhoodSearch::take_out(int robot) {
     }
     partners_[robot].clear();
     reservations_.remove(robot, view(robot));
-    cost_ -= arrival(robot);
+    cost_ -= arrival_time(robot);
 }
 
 PathView NeighbourhoodSearch::view(int robot) const { return {problem_->starts[robot], plan_[robot]}; }

@@ -52,8 +52,8 @@ private:
     int distance(int robot) const { return problem_->distances.to_goal_of(robot)[problem_->starts[robot]]; }
     void insert(int robot);
     void take_out(int robot);
-    int arrival(int robot) const { return static_cast<int>(plan_[robot].size()); }
-    int delay(int robot) const { return arrival(robot) - distance(robot); }
+    int arrival_time(int robot) const { return static_cast<int>(plan_[robot].size()); }
+    int delay(int robot) const { return arrival_time(robot) - distance(robot); }
     PathView view(int robot) const;
 
     const Problem* problem_ = nullptr;  // during a search

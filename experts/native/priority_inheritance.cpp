@@ -41,7 +41,7 @@ PibtRun run_pibt(const Problem& problem, bool swap, int max_steps, std::uint64_t
         for (std::size_t robot = 0; robot < num_robots; ++robot) {
             if (cells[robot] == problem.goals[robot]) continue;
             run.solved = false;
-            run.arrivals[robot] = time + 1;
+            run.arrival_times[robot] = time + 1;
         }
         if (run.solved || time == max_steps || budget.look()) return run;
         std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return under_way[a] > under_way[b]; });

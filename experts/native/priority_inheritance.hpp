@@ -14,7 +14,7 @@ namespace mapf {
 struct PibtRun {
     bool solved = false;
     std::vector<std::uint8_t> actions;  // (T, N): of every step taken
-    std::vector<int> arrivals;          // (N): since when each robot has been on its goal, if solved
+    std::vector<int> arrival_times;     // (N): since when each robot has been on its goal, if solved
 };
 
 // Each robot prefers the moves that bring it closer to its goal, ties in a random order drawn from `seed`. Robots that

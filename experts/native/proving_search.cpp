@@ -41,7 +41,7 @@ void ProvingSearch::open_root() {
     Node root{none, 0, 0, 0, false, {}, 0, 0};
     for (std::size_t robot = 0; robot < num_robots_; ++robot) {
         const auto path = view(root_paths_[robot]);
-        root.cost += path.arrival();
+        root.cost += path.arrival_time();
         root.conflicts += traffic_.conflicts(path);
         traffic_.add(path);
         loaded_[robot] = root_paths_[robot];
@@ -286,7 +286,7 @@ bool ProvingSearch::replan(int child, int robot, Budget& budget) {
     traffic_.remove(old_path);
     node.conflicts -= traffic_.conflicts(old_path);
     node.conflicts += builder_.best_path(all, traffic_, new_actions_);
-    node.cost += all.length - old_path.arrival();
+    node.cost += all.length - old_path.arrival_time();
     const int path = store(robot, child, new_actions_);
     traffic_.add(view(path));
     changes_.push_back({robot, path});

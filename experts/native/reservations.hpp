@@ -48,7 +48,7 @@ public:
             auto& visits = visits_[cell];
             visits.insert(from(visits, time + 1), {time, robot});
         });
-        rests_[end_of(path)] = {path.arrival(), robot};
+        rests_[end_of(path)] = {path.arrival_time(), robot};
     }
 
     void remove(int robot, const PathView& path) {
@@ -124,7 +124,7 @@ public:
             before = cell;
         });
         const auto& visits = visits_[before];
-        for (auto visit = from(visits, path.arrival() + 1); visit != visits.end(); ++visit) meet(visit->robot);
+        for (auto visit = from(visits, path.arrival_time() + 1); visit != visits.end(); ++visit) meet(visit->robot);
     }
 
 private:

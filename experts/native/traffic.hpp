@@ -21,7 +21,7 @@ struct PathView {
     int start;
     std::span<const std::uint8_t> actions;
 
-    int arrival() const { return static_cast<int>(actions.size()); }
+    int arrival_time() const { return static_cast<int>(actions.size()); }
 };
 
 inline int reversed(int action) { return action ^ 2; }  // up <-> down, left <-> right
@@ -45,7 +45,7 @@ public:
         steps_taken_ = 0;
     }
 
-    void add(const PathView& path) { count(path, 1, path.arrival()); }
+    void add(const PathView& path) { count(path, 1, path.arrival_time()); }
     void remove(const PathView& path) { count(path, -1, forever); }
 
     // No path that was added arrives later than this.

@@ -48,7 +48,7 @@ struct Room {
 
 // Output arrays for the observations of a batch of one team and its action masks (N, 5).
 template <class T>
-struct Memory {
+struct AgentBuffers {
     Room<T> room;
     InOut<std::int8_t, 2> masks;
 };
@@ -185,17 +185,17 @@ public:
             [&](std::size_t count, const auto& job) { for_each(count, job); });
     }
 
-    Memory<T> memory(nb::handle out, InOut<std::int8_t, 2> masks) const { return {room_of(out), std::move(masks)}; }
+    AgentBuffers<T> agent_buffers(nb::handle out, InOut<std::int8_t, 2> masks) const { return {room_of(out), std::move(masks)}; }
 
     // Fills dictionaries by agent with the outcome of the last step of a batch of one team, and its action masks. Returns
     // true if the episode has ended.
-    bool outcome_by_agent(const Memory<T>& memory, nb::list agents, nb::dict rewards, nb::dict terminated,
+    bool outcome_by_agent(const AgentBuffers<T>& buffers, nb::list agents, nb::dict rewards, nb::dict terminated,
                           nb::dict truncated, nb::dict infos) {
         const std::size_t N = teams_.num_agents;
         if (teams_.num_envs != 1 || agents.size() != N) fail("give one name for each agent of one team");
-        require_masks(memory);
+        require_masks(buffers);
         write_action_mask(teams_, 0);
-        std::copy_n(teams_.action_mask, N * num_actions, memory.masks.data());
+        std::copy_n(teams_.action_mask, N * num_actions, buffers.masks.data());
         const std::array flags{teams_.replaced, teams_.on_goal, teams_.arrived};
         const std::size_t num_flags = options_.lifelong ? 3 : 2;
         PyObject* const ended[2] = {teams_.terminated[0] ? Py_True : Py_False, teams_.truncated[0] ? Py_True : Py_False};
@@ -215,15 +215,15 @@ public:
     }
 
     // `step` and `outcome_by_agent` of the only team; None, and nothing done, if the actions cannot be read.
-    std::optional<bool> step_agents(nb::dict actions, const Memory<T>& memory, nb::list agents, nb::dict rewards,
+    std::optional<bool> step_agents(nb::dict actions, const AgentBuffers<T>& buffers, nb::list agents, nb::dict rewards,
                                     nb::dict terminated, nb::dict truncated, nb::dict infos) {
         wanted_.resize(teams_.num_agents);
         if (teams_.num_envs != 1 || !read_actions(actions, agents, wanted_)) return std::nullopt;
         require_actions(wanted_.data(), 1, wanted_.size());
-        require_masks(memory);
-        const Percepts<T> percepts = percepts_of(memory.room);
+        require_masks(buffers);
+        const Percepts<T> percepts = percepts_of(buffers.room);
         run({wanted_.data(), nullptr}, &percepts, false);
-        return outcome_by_agent(memory, agents, rewards, terminated, truncated, infos);
+        return outcome_by_agent(buffers, agents, rewards, terminated, truncated, infos);
     }
 
     // Begins episodes of M chosen teams on the given instances; nothing is changed if one of them cannot begin.
@@ -295,7 +295,7 @@ private:
         return nb::cast<InOut<Value, dims>>(state_.attr(name), false);
     }
 
-    // The memory of an array of the state, whose shape is checked; nullptr if it may be missing and is empty.
+    // The data of an array of the state, whose shape is checked; nullptr if it may be missing and is empty.
     template <class Value>
     Value* own(const char* name, std::initializer_list<std::size_t> shape, bool may_miss = false) {
         auto held = nb::cast<nb::ndarray<Value, nb::c_contig, nb::device::cpu>>(state_.attr(name), false);
@@ -326,13 +326,13 @@ private:
             (options_.senses.robot_columns > 0 && !nb::try_cast(part(2), room.scalars, false)) ||
             (options_.senses.edge_columns > 0 && !nb::try_cast(part(3), room.edge_attr, false)))
             throw nb::type_error(
-                (std::string("out must be an Observation of contiguous memory as buffers() makes it: ") +
+                (std::string("out must be an Observation of contiguous arrays as buffers() makes it: ") +
                  (sizeof(T) == 1 ? "uint8" : "float32") + " for the views and float32 for the rest")
                     .c_str());
         return room;
     }
 
-    // The memory of a room whose shapes are right.
+    // The buffers of a room whose shapes are right.
     Percepts<T> percepts_of(const Room<T>& room) const {
         const auto& senses = options_.senses;
         const std::size_t B = teams_.num_envs, N = teams_.num_agents, side = senses.side();
@@ -340,7 +340,7 @@ private:
         const auto fits = [](const auto& array, std::initializer_list<std::size_t> shape, const char* what) {
             for (std::size_t axis = 0; axis < shape.size(); ++axis)
                 if (array.shape(axis) != shape.begin()[axis])
-                    fail(std::string("the memory for ") + what + " must have shape " + shown(shape));
+                    fail(std::string("the buffer for ") + what + " must have shape " + shown(shape));
         };
         fits(room.fov, {B, N, C, side, side}, "views");
         fits(room.graph, {B, N, N}, "graphs");
@@ -361,9 +361,9 @@ private:
         return chosen ? chosen->data() : nullptr;
     }
 
-    void require_masks(const Memory<T>& memory) const {
-        if (memory.masks.shape(0) != teams_.num_agents || memory.masks.shape(1) != num_actions)
-            fail("the memory for masks must have shape " + shown({teams_.num_agents, num_actions}));
+    void require_masks(const AgentBuffers<T>& buffers) const {
+        if (buffers.masks.shape(0) != teams_.num_agents || buffers.masks.shape(1) != num_actions)
+            fail("the buffer for masks must have shape " + shown({teams_.num_agents, num_actions}));
     }
 
     void perceive_into(std::size_t b, TeamScratch<T>& scratch, const Percepts<T>& all) {
@@ -434,8 +434,8 @@ private:
 };
 
 template <class T>
-void define(nb::module_& m, const char* name, const char* memory) {
-    nb::class_<Memory<T>>(m, memory, "Where the observations and action masks of the only team of a batch go.");
+void define(nb::module_& m, const char* name, const char* buffers) {
+    nb::class_<AgentBuffers<T>>(m, buffers, "Where the observations and action masks of the only team of a batch go.");
     nb::class_<Stepper<T>>(m, name, "The rules of motion and perception, bound to the arrays of B teams.")
         .def(nb::init<nb::object, nb::handle, int>(), "state"_a, "config"_a, "threads"_a)
         .def("step", &Stepper<T>::step, "actions"_a, "out"_a.none(), "skip_ended"_a,
@@ -446,12 +446,12 @@ void define(nb::module_& m, const char* name, const char* memory) {
              "Write what the robots perceive, of all teams or of the chosen ones (B,).")
         .def("bag", &Stepper<T>::bag, "chosen"_a.none(),
              "The bag of the teams that are under way, all of them or the chosen ones (B,).")
-        .def("memory", &Stepper<T>::memory, "out"_a, "masks"_a.noconvert(),
-             "An observation of the only team and masks (N, 5) as memory for `step_agents` and `outcome_by_agent`.")
-        .def("outcome_by_agent", &Stepper<T>::outcome_by_agent, "memory"_a, "agents"_a, "rewards"_a, "terminated"_a,
+        .def("agent_buffers", &Stepper<T>::agent_buffers, "out"_a, "masks"_a.noconvert(),
+             "An observation of the only team and masks (N, 5) as buffers of `step_agents` and `outcome_by_agent`.")
+        .def("outcome_by_agent", &Stepper<T>::outcome_by_agent, "buffers"_a, "agents"_a, "rewards"_a, "terminated"_a,
              "truncated"_a, "infos"_a,
              "Write the masks and fill dictionaries with what the last step brought to the agents of the only team.")
-        .def("step_agents", &Stepper<T>::step_agents, "actions"_a, "memory"_a, "agents"_a, "rewards"_a, "terminated"_a,
+        .def("step_agents", &Stepper<T>::step_agents, "actions"_a, "buffers"_a, "agents"_a, "rewards"_a, "terminated"_a,
              "truncated"_a, "infos"_a,
              "Step the only team by actions by agent and fill the dictionaries; whether the episode has ended, or None "
              "if the actions cannot be read.")
@@ -465,8 +465,8 @@ void define(nb::module_& m, const char* name, const char* memory) {
 }  // namespace
 
 void define_stepper(nb::module_& m) {
-    define<float>(m, "StepperFloat32", "MemoryFloat32");
-    define<std::uint8_t>(m, "StepperUint8", "MemoryUint8");
+    define<float>(m, "StepperFloat32", "AgentBuffersFloat32");
+    define<std::uint8_t>(m, "StepperUint8", "AgentBuffersUint8");
     m.def("rows_by_agent", &rows_by_agent, "agents"_a, "names"_a, "columns"_a,
           "{agent: {name: column[i]}} as new dictionaries; without names {agent: column[i]}.");
 }

@@ -128,7 +128,7 @@ def test_a_robot_leaves_its_goal_and_pays_for_coming_back() -> None:
     require_solution(instance, result)
     assert result.cost == plan_oracles.optimal_cost(grid, instance.starts, instance.goals) == 7
     assert result.solution is not None
-    assert result.solution.arrivals.tolist() == [3, 4]
+    assert result.solution.arrival_times.tolist() == [3, 4]
 
 
 def test_a_swap_in_a_corridor_is_proved_infeasible() -> None:

@@ -123,7 +123,7 @@ def test_progress_is_reported_during_the_work(monkeypatch: pytest.MonkeyPatch) -
     solved: list[int] = []
     solve_batch = many.solve_batch
     monkeypatch.setattr(
-        many, "solve_batch", lambda cases, **how: (solved.append(len(cases)), solve_batch(cases, **how))[1]
+        many, "solve_batch", lambda batch, **how: (solved.append(len(batch)), solve_batch(batch, **how))[1]
     )
     when: list[int] = []
     experts.solve_many([INSTANCES[0]] * 150, progress=lambda done, _: when.append(len(solved)))

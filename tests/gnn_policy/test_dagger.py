@@ -191,7 +191,7 @@ def test_collection_plays_the_weights_of_the_moment(cases, policy):
     demonstrator.close()
     for case, positions, _ in visits(idle, cases):
         assert np.array_equal(positions, cases.instances[case].starts)
-    assert len(idle) == len(before), "a state where a team is stuck counts once for each step"
+    assert len(idle) == len(before), "a state where a team stays counts once for each step"
 
 
 def assert_equal(one, other):
@@ -317,14 +317,14 @@ def plan_paths(case, **limits):
     return solution.paths
 
 
-def test_plans_from_where_teams_are_stuck(cases, idle_policy):
+def test_plans_from_where_teams_failed(cases, idle_policy):
     """Which teams those are is read from all states of the same rollouts: they never began another case."""
     teams, length, batches = CONFIG.rollout_teams, 10, 6
     config = replace(CONFIG, beta_decay=0.6, rollout_length=length, seed=3)
     steps = teams * length * batches
     visited = visits(collected(config, idle_policy, cases, 1, steps)[0], cases)
-    demonstrations, unsolved = collected(replace(config, aggregation="stuck"), idle_policy, cases, 1, steps)
-    stuck = visits(demonstrations, cases)
+    demonstrations, unsolved = collected(replace(config, aggregation="failed"), idle_policy, cases, 1, steps)
+    planned = visits(demonstrations, cases)
     assert unsolved == 0
     following, failed = 0, 0
     for team in range(teams * batches):
@@ -333,15 +333,15 @@ def test_plans_from_where_teams_are_stuck(cases, idle_policy):
         if any(other != case for other, *_ in own):
             continue
         plan = plan_paths(cases.instances[case].at(last), w=config.w, node_limit=config.expert_nodes)
-        block = stuck[following : following + len(plan) - 1]
+        block = planned[following : following + len(plan) - 1]
         if len(plan) == 2 and not (block and np.array_equal(block[0][1], plan[0])):
             continue  # it arrived with its last step
         assert {i for i, *_ in block} == {case}
         assert np.array_equal([positions for _, positions, _ in block], plan[:-1])
         assert np.array_equal([after(positions, moves) for _, positions, moves in block], plan[1:])
         following, failed = following + len(block), failed + 1
-    assert following == len(stuck)
-    assert 3 < failed < teams * batches - 3, "too few teams are stuck, or too few are not"
+    assert following == len(planned)
+    assert 3 < failed < teams * batches - 3, "too few teams failed, or too few did not"
 
 
 @pytest.mark.parametrize("kind", FAMILIES)
@@ -397,20 +397,20 @@ def test_plans_begin_more_often_where_a_robot_is_stuck(cases, idle_policy):
     assert shares[1e-9] < shares[1.0] <= shares[1e9] == 1.0
 
 
-def test_where_no_team_is_stuck_nothing_is_demonstrated(policy):
+def test_where_no_team_failed_nothing_is_demonstrated(policy):
     near = Instance(np.zeros((2, 3), bool), [[0, 0], [1, 0]], [[0, 1], [1, 0]])
     single = make_cases("train", seed=0, maps=1, cases_per_map=1, families=FAMILIES["alike"])
     single = replace(single, instances=[near], grids=[near.grid])
-    config = replace(CONFIG, aggregation="stuck", beta_decay=1.0, rollout_length=5)
+    config = replace(CONFIG, aggregation="failed", beta_decay=1.0, rollout_length=5)
     found, unsolved = collected(config, policy, single, 1, 1)
     assert (len(found), unsolved) == (0, 0)
 
 
 def test_round_zero_imitates_whatever_is_aggregated_later(cases, policy):
-    visited, stuck = (
-        collected(replace(CONFIG, aggregation=each), policy, cases, 0, 100)[0] for each in ("visited", "stuck")
+    visited, failed = (
+        collected(replace(CONFIG, aggregation=each), policy, cases, 0, 100)[0] for each in ("visited", "failed")
     )
-    assert_equal(visited, stuck)
+    assert_equal(visited, failed)
 
 
 def test_weights_seed_and_beta_of_a_round_reach_the_collectors_processes(cases, policy):

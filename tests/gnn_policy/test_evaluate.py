@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, evaluation_report, metrics, save
+from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluate, evaluation_tables, metrics, save
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 from mapf_env import random_instance, save_instances
@@ -44,7 +44,7 @@ def evaluated(monkeypatch, *arguments):
     """Return the settings, the folder and the options with which the command would evaluate."""
     calls = []
     monkeypatch.setattr(
-        evaluation_report,
+        evaluation_tables,
         "evaluate_and_report",
         lambda policy, config, folder, console, **how: calls.append((config, folder, how)),
     )

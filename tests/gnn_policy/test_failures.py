@@ -120,7 +120,7 @@ def test_it_is_the_definition_whatever_the_order_of_robots_and_the_side_of_the_m
 def played_as(instances, solutions):
     """Return the `Rollouts` of these paths, with T_max 40."""
     on_goal = [(each.paths[-1] == case.goals).all(axis=1) for case, each in zip(instances, solutions, strict=True)]
-    times = [np.where(there, each.arrivals, 40) for there, each in zip(on_goal, solutions, strict=True)]
+    times = [np.where(there, each.arrival_times, 40) for there, each in zip(on_goal, solutions, strict=True)]
     nothing = np.zeros(len(instances))
     return Rollouts(
         instances=instances,

@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 
 import experts
-from gnn_policy import DecentralizedPolicy, PolicyConfig, metrics, rollout
+from gnn_policy import DecentralizedPolicy, PolicyConfig, evaluation_tables, metrics, rollout
 from gnn_policy.baselines import GreedyActor, RandomActor
 from gnn_policy.cases import Family, make_cases
 from gnn_policy.execution import Execution
@@ -222,7 +222,7 @@ def test_the_numbers_are_strict_json_also_where_nothing_was_solved(compared):
 def test_the_table_shows_every_figure_within_eighty_columns(compared):
     reference, _, rows, _, _ = compared
     shown = io.StringIO()
-    Console(file=shown, width=80).print(metrics.table("teams", metrics.as_json(rows, reference)))
+    Console(file=shown, width=80).print(evaluation_tables.success_table("teams", metrics.as_json(rows, reference)))
     text = shown.getvalue()
     assert "…" not in text
     for row in rows:
@@ -257,7 +257,7 @@ def test_a_lifelong_comparison_is_the_throughput_of_every_row(compared):
         assert np.array_equal(seen.throughput, again.throughput)
     assert json.loads(json.dumps(table, allow_nan=False)) == table
     shown = io.StringIO()
-    Console(file=shown, width=80).print(metrics.lifelong_table("teams", table))
+    Console(file=shown, width=80).print(evaluation_tables.lifelong_table("teams", table))
     for row in table["rows"]:
         assert f"{row['throughput']['mean']:.3f}" in shown.getvalue()
 

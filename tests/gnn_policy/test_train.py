@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from gnn_policy import Execution, PolicyConfig, load, results_file, train
+from gnn_policy import Execution, PolicyConfig, load, results_json, train
 from gnn_policy.config import TrainConfig
 from gnn_policy.recipes import RECIPES
 from mapf_env import save_map
@@ -218,8 +218,8 @@ def test_a_run_killed_in_its_final_evaluation_is_finished_by_the_same_command(tm
             raise KeyboardInterrupt
         return write_whole(path, *given, **options)
 
-    write_whole = results_file.write_whole
-    monkeypatch.setattr(results_file, "write_whole", watched)
+    write_whole = results_json.write_whole
+    monkeypatch.setattr(results_json, "write_whole", watched)
     with pytest.raises(SystemExit) as end:
         train.main(arguments)
     assert end.value.code == 130

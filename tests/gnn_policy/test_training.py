@@ -93,7 +93,7 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
     [
         {},
         {"expert": "pibt", "robot_order": "random", "beta_decay": 0.5},
-        {"aggregation": "stuck", "expert": "experts:lacam"},
+        {"aggregation": "failed", "expert": "experts:lacam"},
         {"policy": replace(CONFIG.policy, graph_layer="own_layers:Forgetful")},
         {"families": MIXED.families, "augment": True, "beta_decay": 0.5},
         {

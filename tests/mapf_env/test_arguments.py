@@ -237,8 +237,8 @@ CALLS: dict[str, Any] = {
         {name: SETTINGS[name] for name in ("height", "width", "density", "style", "num_agents")}
         | {"seed": SEED, "grid": but(ARRAY, NoneType)},
     ),
-    "random_cases": (
-        mapf_env.random_cases,
+    "random_starts_and_goals": (
+        mapf_env.random_starts_and_goals,
         {"seeds": [1], "grids": GRID[None], "num_agents": 2},
         {
             "seeds": ARRAY,

@@ -468,8 +468,8 @@ def test_assigned_goals_are_seen_as_if_the_episode_had_begun_with_them(seed: int
     other = BatchedEnv(2, task=task, **settings)
     fresh = [random_instance(grid=grid, num_agents=3, seed=int(generator.integers(2**32))).goals for grid in env.grids]
     env.assign_goals(fresh)
-    cases = [Instance(*parts) for parts in zip(env.grids, env.positions, fresh, strict=True)]
-    expected = other.reset(seed=0, instances=cases)
+    instances = [Instance(*parts) for parts in zip(env.grids, env.positions, fresh, strict=True)]
+    expected = other.reset(seed=0, instances=instances)
     assert_equal(env.observe(), expected)
     assert np.array_equal(env.goals, fresh)
     assert np.array_equal(env.on_goal(), other.on_goal())

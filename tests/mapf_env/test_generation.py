@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 
 import oracles
 import strategies
-from mapf_env import Instance, Maze, Rooms, Walls, Warehouse, random_cases, random_instance, random_map, random_maps
+from mapf_env import (
+    Instance,
+    Maze,
+    Rooms,
+    Walls,
+    Warehouse,
+    random_instance,
+    random_map,
+    random_maps,
+    random_starts_and_goals,
+)
 from mapf_env.generation import MapStyle
 
 Style = Literal["cells", "walls"]
@@ -113,7 +123,7 @@ def test_styles_differ() -> None:
 def test_placement_is_uniform_over_the_free_cells() -> None:
     grid = np.zeros((4, 4), bool)
     grid[1, 1] = grid[2, 3] = True
-    starts, goals = random_cases(range(7000), np.broadcast_to(grid, (7000, 4, 4)), 3)
+    starts, goals = random_starts_and_goals(range(7000), np.broadcast_to(grid, (7000, 4, 4)), 3)
     for robot in range(3):
         for cells in (starts[:, robot], goals[:, robot]):
             count = np.zeros((4, 4), int)
@@ -131,7 +141,7 @@ def test_robots_starts_are_independent_of_the_map_of_the_same_seed(style: Style)
     padded = np.pad(grids, ((0, 0), (1, 1), (1, 1))).astype(float)
     neighbours = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
     chance = (neighbours * ~grids).sum() / (~grids).sum()
-    for cells in random_cases(seeds, grids, 10):
+    for cells in random_starts_and_goals(seeds, grids, 10):
         seen = neighbours[np.arange(len(seeds))[:, None], cells[..., 0], cells[..., 1]].mean(axis=0)
         assert np.abs(seen - chance).max() < 0.06  # five standard errors
 
@@ -188,7 +198,7 @@ def test_bad_seeds_are_refused() -> None:
         with pytest.raises(ValueError, match=r"seeds must have shape \(B,\): a vector of non-negative integers, got"):
             random_maps(seeds)
     with pytest.raises(ValueError, match="give one seed for each grid"):
-        random_cases([1, 2], np.zeros((3, 4, 4), bool), 2)
+        random_starts_and_goals([1, 2], np.zeros((3, 4, 4), bool), 2)
 
 
 def test_large_maps() -> None:

@@ -632,11 +632,11 @@ def test_the_outcome_of_a_step_is_of_the_robots_present_before_it() -> None:
 
 
 def test_the_radius_grows_at_reset_until_the_robots_that_are_there_are_connected() -> None:
-    cases = [random_instance(num_agents=n, height=9, width=9, seed=n) for n in (2, 3, 5, 8)]
+    instances = [random_instance(num_agents=n, height=9, width=9, seed=n) for n in (2, 3, 5, 8)]
     settings: dict[str, Any] = {"num_agents": 8, "height": 9, "width": 9, "comm_radius": 1.0, "fill": True}
     env = BatchedEnv(4, comm_range="connected", **settings)
-    env.reset(seed=0, instances=cases)
-    assert env.comm_radius.tolist() == [rules.connecting_radius(case.starts, 1.0) for case in cases]
+    env.reset(seed=0, instances=instances)
+    assert env.comm_radius.tolist() == [rules.connecting_radius(instance.starts, 1.0) for instance in instances]
     assert (env.comm_radius > 1.0).all()
     grown = env.comm_radius
     env.step(np.full((4, 8), oracles.IDLE))
@@ -657,7 +657,7 @@ def test_cases_are_drawn_by_the_seed() -> None:
         BatchedEnv(1, num_agents=4, height=5, width=5, cases=cases)
 
 
-def test_observations_are_written_into_the_callers_memory() -> None:
+def test_observations_are_written_into_the_callers_buffers() -> None:
     env, control = BatchedEnv(2, num_agents=3), BatchedEnv(2, num_agents=3)
     out = env.buffers()
     assert env.reset(seed=0, out=out) is out
@@ -667,16 +667,16 @@ def test_observations_are_written_into_the_callers_memory() -> None:
     assert np.array_equal(out.fov, expected.observation.fov)
     assert env.observe(out=out) is out
     wrong = out._replace(fov=np.empty((2, 3, 3, 11, 10), np.float32))
-    with pytest.raises(ValueError, match="the memory for views must have shape"):
+    with pytest.raises(ValueError, match="the buffer for views must have shape"):
         env.step([[4, 4, 4]] * 2, out=wrong)
     lists: list[dict[str, Any]] = [{"robot_features": ("on_goal",)}, {"edge_features": ("on_goal",)}]
     for features in lists:
         more = BatchedEnv(2, num_agents=3, **features)
         more.reset(seed=0, out=more.buffers())
-        with pytest.raises(ValueError, match=r"the memory for (scalars|edge_attr) must have shape \(2, 3, (3, )?1\)"):
+        with pytest.raises(ValueError, match=r"the buffer for (scalars|edge_attr) must have shape \(2, 3, (3, )?1\)"):
             more.step([[4, 4, 4]] * 2, out=out)
     for wrong in (out._replace(fov=out.fov.astype(np.float64)), tuple(out)[:2], out.fov):
-        with pytest.raises(TypeError, match="out must be an Observation of contiguous memory as buffers"):
+        with pytest.raises(TypeError, match="out must be an Observation of contiguous arrays as buffers"):
             env.step([[4, 4, 4]] * 2, out=wrong)  # pyright: ignore[reportCallIssue, reportArgumentType]
     with pytest.raises(ValueError, match="a step without observation needs no arrays"):
         env.step([[4, 4, 4]] * 2, out=out, observe=False)  # pyright: ignore[reportCallIssue, reportArgumentType]

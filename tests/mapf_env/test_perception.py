@@ -152,20 +152,20 @@ def test_a_mask_chooses_among_the_teams_that_are_under_way() -> None:
 @pytest.mark.parametrize("radius", [0.0, 1.0, 2.5, 6.0, float("inf")])
 @pytest.mark.parametrize("weights", ["binary", "distance"])
 def test_edges_of_large_teams_are_those_of_the_dense_graph(radius: float, weights: Any) -> None:
-    case = random_instance(num_agents=400, height=40, width=30, density=0.1, seed=0)
-    states = States.start_of([case], Senses(comm_radius=radius), [0])
-    bag = perceive(states, MapSet([case.grid], 4), Senses(comm_weights=weights))
-    dense = rules.communication_graph(case.starts, radius, weights=weights)
+    instance = random_instance(num_agents=400, height=40, width=30, density=0.1, seed=0)
+    states = States.start_of([instance], Senses(comm_radius=radius), [0])
+    bag = perceive(states, MapSet([instance.grid], 4), Senses(comm_weights=weights))
+    dense = rules.communication_graph(instance.starts, radius, weights=weights)
     receiver, sender = np.nonzero(dense)
     assert np.array_equal(bag.edge_index, [sender, receiver])
     assert np.array_equal(bag.edge_weight, dense[receiver, sender])
 
 
 def test_lost_messages_are_those_of_the_dense_graph() -> None:
-    case = random_instance(num_agents=60, height=12, width=12, density=0.1, seed=0)
-    states = States.start_of([case] * 3, Senses(comm_radius=2.5), [0] * 3, seeds=[1, 2, 3])
-    bag = perceive(states, MapSet([case.grid], 4), Senses(), message_loss=0.4)
-    graph = rules.communication_graph(np.array([case.starts] * 3), 2.5)
+    instance = random_instance(num_agents=60, height=12, width=12, density=0.1, seed=0)
+    states = States.start_of([instance] * 3, Senses(comm_radius=2.5), [0] * 3, seeds=[1, 2, 3])
+    bag = perceive(states, MapSet([instance.grid], 4), Senses(), message_loss=0.4)
+    graph = rules.communication_graph(np.array([instance.starts] * 3), 2.5)
     kept = rules.lose_messages(graph, 0.4, states.seeds, np.zeros(3, np.int64))
     team, receiver, sender = np.nonzero(kept)
     assert np.array_equal(bag.edge_index, [team * 60 + sender, team * 60 + receiver])

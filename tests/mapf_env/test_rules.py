@@ -61,11 +61,11 @@ def test_every_joint_action_of_a_small_team(
     for cell in blocked:
         grid[cell] = True
     teams = list(combinations(sorted(oracles.free_cells(grid)), num_agents))
-    cases = list(product(teams, product(range(5), repeat=num_agents)))
-    if len(cases) > 8000:
-        cases = cases[:: len(cases) // 8000]
-    executed = shield(grid, [team for team, _ in cases], [wanted for _, wanted in cases]).tolist()
-    for (team, wanted), done in zip(cases, executed, strict=True):
+    trials = list(product(teams, product(range(5), repeat=num_agents)))
+    if len(trials) > 8000:
+        trials = trials[:: len(trials) // 8000]
+    executed = shield(grid, [team for team, _ in trials], [wanted for _, wanted in trials]).tolist()
+    for (team, wanted), done in zip(trials, executed, strict=True):
         assert oracles.shield_faults(grid, team, wanted, done) == []
 
 
@@ -206,7 +206,7 @@ def test_the_graph_takes_lists_and_names_wrong_arguments() -> None:
         communication_graph([0, 0], 5.0)
 
 
-def test_results_can_be_written_into_the_callers_memory() -> None:
+def test_results_can_be_written_into_the_callers_buffers() -> None:
     grid, team = np.zeros((1, 2, 3), bool), np.array([[[0, 0], [1, 1]]], np.int32)
     fov, graph = np.full((1, 2, 3, 5, 5), 9, np.uint8), np.full((1, 2, 2), 9, np.float32)
     maps = rules.bordered(grid, 1, np.uint8)

@@ -42,7 +42,7 @@ def test_actions_walk_the_paths(walk: tuple[Instance, Solution]) -> None:
 def test_costs_count_until_the_last_arrival(walk: tuple[Instance, Solution]) -> None:
     solution = walk[1]
     arrivals = [oracles.arrival(oracles.cells(path)) for path in solution.paths.transpose(1, 0, 2)]
-    assert solution.arrivals.tolist() == arrivals
+    assert solution.arrival_times.tolist() == arrivals
     assert solution.sum_of_costs == sum(arrivals)
     assert solution.makespan == max(arrivals)
 
@@ -78,7 +78,7 @@ def test_conflicts_are_those_of_each_pair_and_step(walk: tuple[Instance, Solutio
 
 def test_waiting_on_a_goal_that_is_left_again_is_paid() -> None:
     there_and_back = Solution(np.array([[[0, 0]], [[0, 1]], [[0, 1]], [[0, 0]], [[0, 1]], [[0, 1]]]))
-    assert there_and_back.arrivals.tolist() == [4]
+    assert there_and_back.arrival_times.tolist() == [4]
     assert repr(there_and_back) == "Solution(1 agents, 5 steps, sum of costs 4, makespan 4)"
 
 

@@ -1,13 +1,16 @@
-"""The end of training and of every evaluation: a table, its numbers as a file, and an animation."""
+"""Evaluation on held-out cases, after training and by command: tables, their numbers as a file, and an animation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.progress import Progress
+from rich.table import Table
 
 from gnn_policy import checkpoint, metrics
 from gnn_policy.cases import Split
@@ -15,7 +18,7 @@ from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.failures import count_failures, worst
 from gnn_policy.network import DecentralizedPolicy
-from gnn_policy.results_file import (
+from gnn_policy.results_json import (
     default_executions,
     read_tables,
     refuse_other_settings,
@@ -92,7 +95,7 @@ def evaluate_and_report(
         bar = progress.add_task("", total=sum(len(executions) + len(each) for each in baselines.values()))
         for name in cases:
             title = table_title(name, settings)
-            make_table = metrics.lifelong_table if lifelong[name] else metrics.table
+            make_table = lifelong_table if lifelong[name] else success_table
             if name in finished:
                 console.print(make_table(title, tables[name]))
                 continue
@@ -127,17 +130,66 @@ def evaluate_and_report(
     console.print(f"numbers: {numbers}", highlight=False)
 
 
+def success_table(title: str, result: dict[str, Any]) -> Table:
+    """Return what `metrics.as_json` returns as a table for the terminal, at most 80 columns wide."""
+    shown = Table(title=title, caption=_caption(result), box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+    shown.add_column("", overflow="fold")
+    for heading in ("success rate", "flowtime\nincrease", "of solved\ncases", "make-\nspan", "lat-\nched"):
+        shown.add_column(heading, justify="right", no_wrap=True)
+    for row in result["rows"]:
+        rate, makespan = row["success_rate"], row["makespan"]["mean"]
+        shown.add_row(
+            row["name"],
+            f"{rate['mean']:.3f} \\[{rate['low']:.3f}, {rate['high']:.3f}]",
+            _percent(row["flowtime_increase"]),
+            _percent(row["flowtime_increase_solved"]),
+            "-" if makespan is None else f"{makespan:.1f}",
+            f"{row['latched']:.3f}",
+        )
+    return shown
+
+
+def lifelong_table(title: str, result: dict[str, Any]) -> Table:
+    """Return what `metrics.compare_lifelong` returns as a table for the terminal."""
+    caption = f"{result['cases']} cases of {result['steps']} steps, 95 % intervals; * knows the whole map"
+    shown = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+    shown.add_column("", overflow="fold")
+    shown.add_column("arrivals\nper step", justify="right", no_wrap=True)
+    for row in result["rows"]:
+        mean, high = row["throughput"]["mean"], row["throughput"]["high"]
+        shown.add_row(row["name"], f"{mean:.3f}" + ("" if high is None else f" ±{high - mean:.3f}"))
+    return shown
+
+
+def _caption(result: dict[str, Any]) -> str:
+    lines = [
+        f"{result['cases']} cases, 95 % intervals; T_max follows from the expert's makespan",
+        f"the expert's flowtime is {result['expert_over_bound']:.4f} x its lower bound",
+        "stuck: stuck robots sample their moves; * knows the whole map",
+    ]
+    if result["unsolved_by_expert"]:
+        lines.append(f"{result['unsolved_by_expert']} more cases are left out: the expert did not solve them")
+    return "\n".join(lines)
+
+
+def _percent(estimate: dict[str, float | None]) -> str:
+    mean, high = estimate["mean"], estimate["high"]
+    if mean is None:
+        return "-"
+    return f"{mean:+.1%}" + ("" if high is None else f" ±{100 * (high - mean):.1f}")
+
+
 def _animate(rollouts: Sequence[Rollouts], path: Path) -> None:
     """Write an animation of a case of the best execution."""
     best = max(rollouts, key=lambda played: (played.success.mean(), played.throughput.mean()))
-    case = _worth_watching(best)
-    lifelong = len(best.goals[case]) > 1
-    outcome = "all on goal" if best.success[case] else "timed out"
+    number = _worth_watching(best)
+    lifelong = len(best.goals[number]) > 1
+    outcome = "all on goal" if best.success[number] else "timed out"
     if lifelong:
-        outcome = f"{best.throughput[case]:.2f} arrivals per step"
-    title = f"Trained policy, {best.instances[case].num_agents} robots: {outcome}"
-    goals = best.goals[case] if lifelong else None
-    animate(best.instances[case], best.solutions[case], path, title=title, goals=goals)
+        outcome = f"{best.throughput[number]:.2f} arrivals per step"
+    title = f"Trained policy, {best.instances[number].num_agents} robots: {outcome}"
+    goals = best.goals[number] if lifelong else None
+    animate(best.instances[number], best.solutions[number], path, title=title, goals=goals)
 
 
 def _worth_watching(played: Rollouts) -> int:

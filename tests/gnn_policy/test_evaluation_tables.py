@@ -8,7 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, evaluation_report
+from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, evaluation_tables
 from gnn_policy.checkpoint import fingerprint
 from gnn_policy.config import TrainConfig
 from gnn_policy.rollout import Rollouts
@@ -36,9 +36,9 @@ def test_the_animation_shows_the_solved_case_of_median_length():
             throughput=np.zeros(count),
         )
 
-    assert evaluation_report._worth_watching(played([True, True, False, True], [9, 4, 5, 6])) == 3
-    assert evaluation_report._worth_watching(played([False, True, False], [1, 7, 9])) == 1
-    assert evaluation_report._worth_watching(played([False, False], [5, 5])) == 0
+    assert evaluation_tables._worth_watching(played([True, True, False, True], [9, 4, 5, 6])) == 3
+    assert evaluation_tables._worth_watching(played([False, True, False], [1, 7, 9])) == 1
+    assert evaluation_tables._worth_watching(played([False, False], [5, 5])) == 0
 
 
 def test_the_numbers_are_written_last(tmp_path, monkeypatch):
@@ -53,11 +53,11 @@ def test_the_numbers_are_written_last(tmp_path, monkeypatch):
         raise RuntimeError("crash")
 
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation_report, "animate", crash)
+        patch.setattr(evaluation_tables, "animate", crash)
         with pytest.raises(RuntimeError, match="crash"):
-            evaluation_report.evaluate_and_report(policy, config, tmp_path, console, threads=1)
+            evaluation_tables.evaluate_and_report(policy, config, tmp_path, console, threads=1)
     assert list(tmp_path.iterdir()) == [], "a run with results.json counts as finished"
-    evaluation_report.evaluate_and_report(policy, config, tmp_path, console, threads=1)
+    evaluation_tables.evaluate_and_report(policy, config, tmp_path, console, threads=1)
     numbers = json.loads((tmp_path / "results.json").read_text())
     assert numbers["tables"]["2"]["cases"] == 4
     assert [row["name"] for row in numbers["tables"]["2"]["rows"]][:4] == [
@@ -95,6 +95,6 @@ def test_the_executions_have_the_shield_of_the_policy(tmp_path):
     config = TrainConfig(
         policy=policy.config, num_agents=2, height=5, width=5, density=0.0, test_maps=1, cases_per_map=1
     )
-    evaluation_report.evaluate_and_report(policy, config, tmp_path, Console(file=io.StringIO(), width=80), threads=1)
+    evaluation_tables.evaluate_and_report(policy, config, tmp_path, Console(file=io.StringIO(), width=80), threads=1)
     rows = json.loads((tmp_path / "results.json").read_text())["tables"]["2"]["rows"]
     assert [row["name"] for row in rows][:4] == ["argmax,pibt", "stuck,1,pibt", "sampled,1,pibt", "random"]
