@@ -108,7 +108,7 @@ def communication_graph(
 def connecting_radius(positions: npt.ArrayLike, radius: float) -> float:
     """Return the least radius * 1.1^k, k = 0, 1, ..., that connects all robots at `positions` (N, 2).
 
-    Source: the code of Li et al. 2020, which grows the radius in this way at the start of each episode and then keeps it.
+    Source: the code of Li et al. 2020, which grows the radius in this way when an episode starts and then keeps it.
     """
     return _native.connecting_radius(arguments.cells(positions, "positions", "(N, 2)"), radius)
 

@@ -90,20 +90,10 @@ def test_the_tutorials_channel_is_as_defined(tmp_path: Path) -> None:
 
     generator, worlds, text = np.random.default_rng(0), [], ""
     for seed in range(20):
-        instance = random_instance(num_agents=5, height=6, width=7, seed=seed)
+        drawn = random_instance(num_agents=5, height=6, width=7, seed=seed)
         moves, radius = generator.integers(-1, 5, (5, HISTORY)), 1 + seed % 3
-        worlds.append(
-            (SimpleNamespace(team=[tuple(c) for c in instance.starts.tolist()], moves=moves.tolist()), radius)
-        )
-        numbers = [
-            6,
-            7,
-            5,
-            radius,
-            *instance.grid.ravel().astype(int),
-            *instance.starts.ravel(),
-            *instance.goals.ravel(),
-        ]
+        worlds.append((SimpleNamespace(team=[tuple(c) for c in drawn.starts.tolist()], moves=moves.tolist()), radius))
+        numbers = [6, 7, 5, radius, *drawn.grid.ravel().astype(int), *drawn.starts.ravel(), *drawn.goals.ravel()]
         text += " ".join(map(str, [*numbers, *moves.ravel()])) + "\n"
     done = subprocess.run([str(tmp_path / "show"), name], input=text, capture_output=True, text=True, check=True)
     seen = 0

@@ -256,11 +256,11 @@ Out<std::int8_t> next_moves(const std::vector<InstanceArrays>& instances, int wi
                             int threads) {
     const auto teams = as_teams(instances);
     std::size_t num_robots = 0;
-    for (const auto& each : cases) num_robots += each.starts.size();
+    for (const auto& each : teams) num_robots += each.starts.size();
     auto [move, array] = mapf::make_array<std::int8_t>({num_robots});
     std::vector<std::vector<std::uint8_t>> found;
     run_without_gil([&](mapf::Interrupt& interrupt) {
-        found = mapf::next_moves(cases, window, rounds, seed, threads, interrupt);
+        found = mapf::next_moves(teams, window, rounds, seed, threads, interrupt);
     });
     for (const auto& moves : found) move = std::copy(moves.begin(), moves.end(), move);
     return array;

@@ -69,12 +69,12 @@ std::vector<PlanLabels> label_plans(std::span<const Team> teams, const LabelOpti
     return labels;
 }
 
-std::vector<std::vector<std::uint8_t>> next_moves(std::span<const Team> cases, int window, int rounds,
+std::vector<std::vector<std::uint8_t>> next_moves(std::span<const Team> teams, int window, int rounds,
                                                   std::uint64_t seed, int threads, Interrupt& interrupt) {
     struct Nothing {};
-    std::vector<std::vector<std::uint8_t>> moves(cases.size());
-    run_jobs<Nothing>(cases.size(), threads, interrupt, [&](std::size_t job, Nothing&, bool polls) {
-        const auto& [grid, starts, goals] = cases[job];
+    std::vector<std::vector<std::uint8_t>> moves(teams.size());
+    run_jobs<Nothing>(teams.size(), threads, interrupt, [&](std::size_t job, Nothing&, bool polls) {
+        const auto& [grid, starts, goals] = teams[job];
         Budget budget(std::numeric_limits<double>::infinity(), interrupt, polls);
         RollingHorizon planner(grid, window, rounds, seed);
         planner.plan(starts, goals, 0, budget);

@@ -41,8 +41,8 @@ struct PlanLabels {
 std::vector<PlanLabels> label_plans(std::span<const Team> teams, const LabelOptions& options, int threads,
                                     Interrupt& interrupt);
 
-// The first joint action (N) of each case's plan by a new planner with a rolling horizon.
-std::vector<std::vector<std::uint8_t>> next_moves(std::span<const Team> cases, int window, int rounds,
+// The first joint action (N) of each team's plan by a new planner with a rolling horizon.
+std::vector<std::vector<std::uint8_t>> next_moves(std::span<const Team> teams, int window, int rounds,
                                                   std::uint64_t seed, int threads, Interrupt& interrupt);
 
 }  // namespace mapf
