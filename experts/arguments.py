@@ -8,6 +8,7 @@ from mapf_env.arguments import MOST_THREADS, cells, each_of, flag, instance_of, 
 
 __all__ = [
     "MOST_THREADS",
+    "address",
     "at_least_one",
     "cells",
     "each_of",
@@ -58,6 +59,13 @@ def seconds(time_limit: float) -> float:
     if not value > 0:
         raise ValueError(f"time_limit must be a number of seconds > 0 (math.inf for no limit), got {time_limit!r}")
     return value
+
+
+def address(cluster: str) -> str:
+    """Return the address of a cluster, a word that is not empty."""
+    if not instance_of(cluster, str, "cluster"):
+        raise ValueError('cluster must be the address of a Ray cluster, "auto" or "local", got an empty string')
+    return cluster
 
 
 def at_least_one(value: int, name: str, maximum: int = 2**63 - 1) -> int:

@@ -10,6 +10,7 @@ from itertools import islice
 from typing import Any
 
 from experts import arguments
+from experts.cluster import connect
 from experts.ecbs import solve, solve_batch
 from experts.lazy_constraints import lacam
 from experts.prioritised_planning import prioritised
@@ -22,6 +23,9 @@ Solver = Callable[[Instance], Result]
 
 Progress = Callable[[int, int], None]
 """Called after each result with the number of instances done and of those solved."""
+
+_MOST_IN_PART = 64
+"""Instances that a worker of a cluster solves at a time, and solves again if it dies."""
 
 SOLVER_NAMES = ("ecbs", "lacam", "prioritised", "pibt")
 
@@ -36,11 +40,13 @@ def solve_many(
     node_limit: int = arguments.DEFAULT_NODE_LIMIT,
     seed: int = 0,
     progress: Progress | None = None,
+    cluster: str | None = None,
 ) -> list[Result]:
-    """Solve each instance as `solve` does, or with another solver, over `threads` threads.
+    """Solve each instance as `solve` does, or with another solver, over `threads` threads or on a cluster.
 
     Instances may differ in maps and numbers of robots. The limits are those of each instance, not of the call. The
-    results do not depend on the number of threads (except for time limits); each is that of the solver called alone.
+    results do not depend on the number of threads, nor on the cluster (except for time limits); each is that of the
+    solver called alone.
 
     Args:
         instances: The problems.
@@ -48,12 +54,15 @@ def solve_many(
             example a `functools.partial` that sets more options; its plans are `audited`.
         w: As in `solve` for `"ecbs"` and as in `lacam` for `"lacam"`, with the default of each; others have none.
         threads: Native solvers do not hold Python's interpreter lock. A function runs in a pool of threads, or in the
-            calling thread if there is one only.
+            calling thread if there is one only. With `cluster="local"` the number of worker processes.
         time_limit: Seconds for each instance, if the named solver has a limit.
         node_limit: Nodes for each instance, if the named solver has a limit.
         seed: Random seed of a named solver.
         progress: Called after each result with the number of instances done and of those solved; of ECBS, which shares
             threads better the more it is given at once, after every 64 or so.
+        cluster: The address of a Ray cluster whose workers solve the instances, one thread each; `"auto"` for the
+            cluster that this machine belongs to, `"local"` for one of worker processes on this machine. A part of the
+            instances whose worker dies is solved again. Needs the extra `cluster`.
 
     Returns:
         One result for each instance, in their order; unsolved ones say why, and may hold a plan without a proof.
@@ -63,8 +72,11 @@ def solve_many(
             returns paths that do not solve the instance.
         TypeError: If an argument has the wrong type, an element of `instances` is not an `Instance`, or a solver's
             answer is not a `Result`.
-        KeyboardInterrupt: On Ctrl-C, which stops ECBS, and any solver on one thread, at once. On more threads other
-            solvers start no further instance, and running ones finish in the background.
+        KeyboardInterrupt: On Ctrl-C, which stops ECBS, and any solver on one thread or on a cluster, at once. On more
+            threads other solvers start no further instance, and running ones finish in the background.
+        ImportError: If Ray is needed and not installed.
+        ConnectionError: If there is no cluster at the address.
+        RuntimeError: If a part of the instances loses its workers again and again.
     """
     problems = list(arguments.each_of(instances, Instance, "instances"))
     return list(
@@ -76,8 +88,9 @@ def solve_many(
             time_limit=time_limit,
             node_limit=node_limit,
             seed=seed,
-            backlog=max(1, len(problems)) if progress is None else arguments.DEFAULT_BACKLOG,
+            backlog=max(1, len(problems)) if progress is None or cluster else arguments.DEFAULT_BACKLOG,
             progress=progress,
+            cluster=cluster,
         )
     )
 
@@ -93,6 +106,7 @@ def solve_stream(
     seed: int = 0,
     backlog: int = arguments.DEFAULT_BACKLOG,
     progress: Progress | None = None,
+    cluster: str | None = None,
 ) -> Iterator[Result]:
     """Solve instances as they come: `solve_many` for more instances than fit into memory, or for an endless stream.
 
@@ -107,8 +121,10 @@ def solve_stream(
         time_limit: As in `solve_many`.
         node_limit: As in `solve_many`.
         seed: As in `solve_many`.
-        backlog: Instances to hold at most. ECBS solves so many at a time.
+        backlog: Instances to hold at most. ECBS solves so many at a time. A large cluster needs some for each of its
+            cores.
         progress: As in `solve_many`.
+        cluster: As in `solve_many`.
 
     Returns:
         An iterator over one result for each instance, in their order, as `solve_many` returns them.
@@ -136,6 +152,9 @@ def solve_stream(
         if w is not None and not isinstance(solver, str):
             raise ValueError("w is an option of named solvers: fix that of a function by functools.partial")
         results = _in_pool(problems, single, threads, backlog)
+    if cluster is not None:
+        solve_part = partial(solve_many, solver=solver, w=w, **limits)
+        results = _on_cluster(problems, solve_part, arguments.address(cluster), threads, backlog)
     return results if progress is None else _reporting(results, progress)
 
 
@@ -225,6 +244,20 @@ def _in_pool(instances: Iterator[Instance], solver: Solver, threads: int, backlo
             yield waiting.popleft().result()
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _on_cluster(
+    instances: Iterator[Instance],
+    solve_part: Callable[[list[Instance]], list[Result]],
+    cluster: str,
+    workers: int,
+    backlog: int,
+) -> Iterator[Result]:
+    with connect(cluster, workers=workers) as found:
+        size = found.size_of_parts(backlog, most=_MOST_IN_PART)
+        parts = iter(lambda: list(islice(instances, size)), [])
+        for solved in found.map(solve_part, parts, ahead=backlog // size):
+            yield from solved
 
 
 def _reporting(results: Iterator[Result], progress: Progress) -> Iterator[Result]:

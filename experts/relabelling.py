@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from experts import _native, arguments
+from experts.cluster import connect
 from mapf_env.instance import Instance
+
+_MOST_IN_PART = 1024
+"""States that a worker of a cluster labels at a time."""
 
 
 def relabel(
@@ -20,6 +26,7 @@ def relabel(
     node_limit: int = arguments.DEFAULT_RELABEL_NODE_LIMIT,
     threads: int = 1,
     seed: int = 0,
+    cluster: str | None = None,
 ) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
     """Return the expert's first joint action in each of B states.
 
@@ -38,6 +45,8 @@ def relabel(
         node_limit: High-level nodes to generate at most for a state.
         threads: Threads to share the states; the labels do not depend on it.
         seed: As in `solve`.
+        cluster: The address of a Ray cluster whose workers label the states, as in `solve_many`; nor do the labels
+            depend on that.
 
     Returns:
         `actions` (B, N) int8, or (R,) with `offsets`, the `Action` of each robot, and `solved` (B,) bool. Where a state
@@ -68,16 +77,23 @@ def relabel(
             f"state {state} holds {sizes[state]} agents, but an instance has {teams[state]}: give each state the "
             "robots of its instance, and offsets where team sizes differ"
         )
-    actions, solved = _native.relabel(
-        [(problem.grid, problem.goals) for problem in problems],
-        problem_of,
-        flat,
-        spans,
-        arguments.suboptimality(w),
-        arguments.at_least_one(node_limit, "node_limit"),
-        arguments.seed(seed),
-        arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS),
-    )
+    limits = {
+        "w": arguments.suboptimality(w),
+        "node_limit": arguments.at_least_one(node_limit, "node_limit"),
+        "seed": arguments.seed(seed),
+    }
+    threads = arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS)
+    if cluster is not None and len(problem_of):
+        with connect(arguments.address(cluster), workers=threads) as workers:
+            size = workers.size_of_parts(len(problem_of), most=_MOST_IN_PART)
+            firsts = range(0, len(problem_of), size)
+            parts = (_part(problems, problem_of, flat, spans, first, first + size) for first in firsts)
+            labels = list(workers.map(partial(_relabel_part, **limits), parts))
+        actions, solved = (np.concatenate(column) for column in zip(*labels, strict=True))
+    else:
+        actions, solved = _native.relabel(
+            [(problem.grid, problem.goals) for problem in problems], problem_of, flat, spans, threads=threads, **limits
+        )
     return (actions.reshape(np.shape(positions)[:2]) if offsets is None else actions), solved
 
 
@@ -93,6 +109,32 @@ def _flat(
     if spans[0] != 0 or spans[-1] != len(flat) or (np.diff(spans) < 1).any():
         raise ValueError(f"offsets must rise from 0 to the number of robots, {len(flat)}, got {spans}")
     return flat, spans.astype(np.int64)
+
+
+Part = tuple[int, list[Instance], npt.NDArray[np.int32], npt.NDArray[np.int64]]
+"""Some of the states: the number of the first, the instance of each, the robots' cells (r, 2), and the offsets of the
+states among them."""
+
+
+def _part(
+    problems: list[Instance],
+    problem_of: npt.NDArray[np.int64],
+    flat: npt.NDArray[np.int32],
+    spans: npt.NDArray[np.int64],
+    begin: int,
+    end: int,
+) -> Part:
+    """Return the states begin..end."""
+    own = spans[begin : end + 1]
+    return begin, [problems[index] for index in problem_of[begin:end]], flat[own[0] : own[-1]], own - own[0]
+
+
+def _relabel_part(part: Part, **limits: Any) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
+    first, instances, positions, offsets = part
+    try:
+        return relabel(instances, positions, offsets=offsets, **limits)
+    except ValueError as error:
+        raise ValueError(f"among the states from number {first} on, {error}") from None
 
 
 def _distinct(instances: list[Instance]) -> tuple[list[Instance], npt.NDArray[np.int64]]:

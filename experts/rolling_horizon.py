@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from experts import _native, arguments
+from experts.cluster import map_cases
 from mapf_env.instance import Instance, as_obstacles
 
 
@@ -81,6 +83,8 @@ class RollingHorizon:
         return actions
 
 
+_MOST_IN_PART = 256
+"""States that a worker of a cluster plans at a time."""
 _STEPS = np.array([(-1, 0), (0, -1), (1, 0), (0, 1), (0, 0)], np.int32)
 
 
@@ -91,6 +95,7 @@ def next_moves(
     rounds: int = arguments.DEFAULT_WINDOW_ROUNDS,
     threads: int = 1,
     seed: int = 0,
+    cluster: str | None = None,
 ) -> npt.NDArray[np.int8]:
     """Return the next joint action of a `RollingHorizon` in each of many states: labels for lifelong tasks.
 
@@ -102,6 +107,7 @@ def next_moves(
         rounds: As for `RollingHorizon`.
         threads: Threads to share the states; the moves do not depend on it.
         seed: As for `RollingHorizon`.
+        cluster: The address of a Ray cluster whose workers plan the states, as in `solve_many`.
 
     Returns:
         (R,) int8, the `Action` of each robot of all states, one state after the other.
@@ -111,10 +117,16 @@ def next_moves(
         TypeError: If an argument has the wrong type.
         KeyboardInterrupt: On Ctrl-C.
     """
-    return _native.next_moves(
-        [(each.grid, each.starts, each.goals) for each in arguments.each_of(instances, Instance, "instances")],
-        arguments.at_least_one(window, "window", maximum=arguments.MAX_WINDOW),
-        arguments.at_least_one(rounds, "rounds", maximum=arguments.MAX_ROUNDS),
-        arguments.seed(seed),
-        arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS),
-    )
+    problems = list(arguments.each_of(instances, Instance, "instances"))
+    limits = {
+        "window": arguments.at_least_one(window, "window", maximum=arguments.MAX_WINDOW),
+        "rounds": arguments.at_least_one(rounds, "rounds", maximum=arguments.MAX_ROUNDS),
+        "seed": arguments.seed(seed),
+    }
+    threads = arguments.at_least_one(threads, "threads", maximum=arguments.MOST_THREADS)
+    if cluster is not None and problems:
+        plan = partial(next_moves, **limits)
+        return np.concatenate(
+            map_cases(plan, problems, arguments.address(cluster), workers=threads, most=_MOST_IN_PART)
+        )
+    return _native.next_moves([(each.grid, each.starts, each.goals) for each in problems], threads=threads, **limits)

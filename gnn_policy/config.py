@@ -162,6 +162,9 @@ class TrainConfig:
     """Random seed for the maps and cases of all three splits."""
     threads: int = 0
     """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
+    cluster: str | None = None
+    """Address of a Ray cluster that labels the states and evaluates the policy, "auto" for the cluster of this machine
+    or "local" for processes here; the results are the same. Needs the extra `cluster`."""
     precision: Precision = "auto"
     """Number format of the network in training: "bfloat16", "float32", or "auto" for bfloat16 where the hardware has
     it."""
@@ -266,7 +269,7 @@ class TrainConfig:
         }[split]
 
     def require_same_settings(self, found: TrainConfig, what: str, option: str) -> None:
-        """Check that found settings equal these, except for `threads` and `device`.
+        """Check that found settings equal these, except for `threads`, `cluster` and `device`.
 
         Args:
             found: The settings of the existing run or model.
@@ -277,7 +280,7 @@ class TrainConfig:
             FileExistsError: If other settings differ; the message names them.
         """
         own, others = asdict(self), asdict(found)
-        differ = [name for name in own if own[name] != others[name] and name not in ("threads", "device")]
+        differ = [name for name in own if own[name] != others[name] and name not in ("threads", "cluster", "device")]
         if differ:
             raise FileExistsError(f"{what} other settings ({', '.join(differ)}): choose another folder with {option}")
 

@@ -82,6 +82,9 @@ class Command:
     """CPU threads; 0 takes as many as affinity, cgroup quota and OMP_NUM_THREADS allow."""
     device: str = "auto"
     """Device of the network: "cpu", "cuda", "mps", or "auto" for the fastest one available."""
+    cluster: str | None = None
+    """Address of a Ray cluster that solves and plays the cases on its CPUs: "auto" for the cluster of this machine, or
+    "local" for as many processes here as there are threads. Needs the extra `cluster`."""
     plugins: tuple[str, ...] = ()
     """Encoders and graph layers of your own, as "module:Class", that the policy's file may import."""
     debug: bool = False
@@ -135,7 +138,8 @@ def _evaluate(command: Command) -> None:
     from gnn_policy.evaluation_tables import evaluate_and_report
 
     torch.set_num_threads(threads)
-    policy = on_device(checkpoint.load(command.policy, plugins=command.plugins), command.device)
+    device = "cpu" if command.cluster is not None and command.device == "auto" else command.device
+    policy = on_device(checkpoint.load(command.policy, plugins=command.plugins), device)
     folder.mkdir(parents=True, exist_ok=True)
     evaluate_and_report(
         policy,
@@ -149,6 +153,7 @@ def _evaluate(command: Command) -> None:
         steps=command.steps,
         threads=threads,
         failures=command.failures,
+        cluster=command.cluster,
     )
 
 

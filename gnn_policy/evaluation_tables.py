@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from experts.cluster import connect
 from gnn_policy import checkpoint, metrics
 from gnn_policy.cases import Split
 from gnn_policy.config import TrainConfig
@@ -44,6 +46,7 @@ def evaluate_and_report(
     whole: bool = False,
     threads: int,
     failures: int = 0,
+    cluster: str | None = None,
 ) -> None:
     """Print one table for each team size; write animation.svg and results.json into `folder`.
 
@@ -65,6 +68,7 @@ def evaluate_and_report(
         threads: CPU threads of the expert.
         failures: Number of cases of the first execution to show next to the expert's solutions, for each table, in
             failures.html; the worst of each kind of failure come first. With them every table is computed.
+        cluster: The address of a Ray cluster that solves and plays the cases, as in `experts.solve_many`.
 
     Raises:
         ValueError: If there is no execution, or `failures` is negative or asked for in a lifelong task.
@@ -91,7 +95,8 @@ def evaluate_and_report(
     lifelong = {name: each.tasks == {"lifelong"} for name, each in cases.items()}
     baselines = {name: metrics.LIFELONG_BASELINES if lifelong[name] else metrics.BASELINES for name in instances}
     scenes: list[Scene] = []
-    with Progress(console=console, transient=True) as progress:
+    connection = nullcontext() if cluster is None else connect(cluster, workers=threads)
+    with connection, Progress(console=console, transient=True) as progress:
         bar = progress.add_task("", total=sum(len(executions) + len(each) for each in baselines.values()))
         for name in cases:
             title = table_title(name, settings)
@@ -105,14 +110,27 @@ def evaluate_and_report(
 
             if lifelong[name]:
                 tables[name], rollouts = metrics.compare_lifelong(
-                    instances[name], policy, executions, steps=steps, seed=config.seed, progress=advance
+                    instances[name],
+                    policy,
+                    executions,
+                    steps=steps,
+                    seed=config.seed,
+                    cluster=cluster,
+                    progress=advance,
                 )
             else:
                 progress.update(bar, description=f"{title}: expert")
                 reference = metrics.ReferenceSet.prepare(
-                    instances[name], w=config.w, timeout=config.timeout, threads=threads, nodes=config.reference_nodes
+                    instances[name],
+                    w=config.w,
+                    timeout=config.timeout,
+                    threads=threads,
+                    nodes=config.reference_nodes,
+                    cluster=cluster,
                 )
-                rows, rollouts = metrics.compare(reference, policy, executions, seed=config.seed, progress=advance)
+                rows, rollouts = metrics.compare(
+                    reference, policy, executions, seed=config.seed, cluster=cluster, progress=advance
+                )
                 progress.advance(bar)
                 kinds = {each.name: count_failures(played) for each, played in zip(executions, rollouts, strict=True)}
                 tables[name] = {**metrics.as_json(rows, reference), "failures": kinds}

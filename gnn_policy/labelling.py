@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,7 @@ class Labeller:
         rounds: Rounds of the neighbourhood search where the first steps of plans are labelled.
         threads: CPU threads.
         clock: The clock that `seconds` are measured by.
+        cluster: The address of a Ray cluster that labels the states, as in `experts.solve_many`.
 
     Raises:
         ValueError: If the solver is unknown.
@@ -48,9 +50,11 @@ class Labeller:
         rounds: int = 400,
         threads: int,
         clock: Callable[[], float] = time.monotonic,
+        cluster: str | None = None,
     ) -> None:
         self._grids, self._w, self._robot_order = grids, w, robot_order
-        self._node_limit, self._rounds, self._threads, self._clock = node_limit, rounds, threads, clock
+        self._node_limit, self._rounds, self._clock = node_limit, rounds, clock
+        self._where: dict[str, Any] = {"threads": threads, "cluster": cluster}
         self._solver = solver if solver in SOLVER_NAMES else import_by_name(solver, "the expert", SOLVER_NAMES)
         self.seconds = 0.0
         """Seconds spent in the expert so far."""
@@ -80,7 +84,7 @@ class Labeller:
             offsets=states.offsets,
             w=self._w,
             node_limit=self._node_limit,
-            threads=self._threads,
+            **self._where,
         )
         moves = np.empty(states.num_robots, np.int8)
         moves[order] = labels
@@ -91,7 +95,7 @@ class Labeller:
         began = self._clock()
         order = self._order(states)
         moves = np.empty(states.num_robots, np.int8)
-        moves[order] = experts.next_moves(self._instances(states, order), threads=self._threads)
+        moves[order] = experts.next_moves(self._instances(states, order), **self._where)
         self.seconds += self._clock() - began
         return moves
 
@@ -108,7 +112,7 @@ class Labeller:
             self._instances(states, order),
             solver=self._solver,
             w=self._w if self._solver == "ecbs" else None,
-            threads=self._threads,
+            **self._where,
             time_limit=math.inf,
             node_limit=self._node_limit,
         )
@@ -179,7 +183,7 @@ class Labeller:
             w=self._w,
             node_limit=self._node_limit,
             rounds=self._rounds,
-            threads=self._threads,
+            **self._where,
         )
         self.seconds += self._clock() - began
         parts = [Demonstrations(states.take(np.empty(0, np.intp)), np.empty(0, np.int8))]

@@ -21,6 +21,8 @@ LIFELONG_STEPS = 256
 """Steps of a lifelong episode in validation, and by default in evaluation."""
 REFERENCE_NODES = 200_000
 """High-level nodes that the expert may generate for a held-out case; several seconds of search."""
+TEAMS_AT_A_TIME = 64
+"""Teams that are played in one batch; on a cluster, by one worker. The same on one machine, for equal numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,13 @@ class ReferenceSet:
 
     @staticmethod
     def prepare(
-        instances: Sequence[Instance], *, w: float, timeout: float, threads: int, nodes: int = REFERENCE_NODES
+        instances: Sequence[Instance],
+        *,
+        w: float,
+        timeout: float,
+        threads: int,
+        nodes: int = REFERENCE_NODES,
+        cluster: str | None = None,
     ) -> ReferenceSet:
         """Solve the cases with the expert; T_max is `timeout` times the makespan of its solution.
 
@@ -78,11 +86,17 @@ class ReferenceSet:
             timeout: T_max in makespans of the expert's solution.
             threads: CPU threads.
             nodes: Nodes that ECBS, and then LaCAM, may generate for a case.
+            cluster: The address of a Ray cluster that solves them, as in `experts.solve_many`.
 
         Raises:
             ValueError: If the expert solves none of them.
         """
-        limits: dict[str, Any] = {"threads": threads, "time_limit": math.inf, "node_limit": nodes}
+        limits: dict[str, Any] = {
+            "threads": threads,
+            "time_limit": math.inf,
+            "node_limit": nodes,
+            "cluster": cluster,
+        }
         results = experts.solve_many(instances, w=w, **limits)
         left = [i for i, result in enumerate(results) if not result.solved]
         for i, plan in zip(
@@ -153,9 +167,12 @@ def compare(
     executions: Sequence[Execution],
     *,
     seed: int = 0,
+    cluster: str | None = None,
     progress: Callable[[str], None] = lambda phase: None,
 ) -> tuple[list[Score], list[Rollouts]]:
     """Compare a policy with the expert and with baselines without learning, on the same cases.
+
+    The cases of an execution are played in batches of `TEAMS_AT_A_TIME`, by a cluster's workers if `cluster` is given.
 
     Returns:
         The rows, those of the executions first, and what the policy did in each execution.
@@ -165,10 +182,18 @@ def compare(
     for execution in executions:
         progress(execution.name)
         played.append(
-            rollout(policy, reference.instances, execution=execution, seed=seed, max_steps=reference.max_steps)
+            rollout(
+                policy,
+                reference.instances,
+                execution=execution,
+                seed=seed,
+                max_steps=reference.max_steps,
+                batch_size=TEAMS_AT_A_TIME,
+                cluster=cluster,
+            )
         )
         rows.append(score(execution.name + mark, reference, played[-1]))
-    return [*rows, *baselines(reference, seed=seed, progress=progress)], played
+    return [*rows, *baselines(reference, seed=seed, cluster=cluster, progress=progress)], played
 
 
 BASELINES = ("random", "greedy*", "greedy,stuck*", "PIBT*", "expert*")
@@ -176,14 +201,26 @@ BASELINES = ("random", "greedy*", "greedy,stuck*", "PIBT*", "expert*")
 
 
 def baselines(
-    reference: ReferenceSet, *, seed: int = 0, progress: Callable[[str], None] = lambda phase: None
+    reference: ReferenceSet,
+    *,
+    seed: int = 0,
+    cluster: str | None = None,
+    progress: Callable[[str], None] = lambda phase: None,
 ) -> list[Score]:
     """Return the rows of `BASELINES`; of the two greedy ones, the second moves at random when it is stuck."""
     cases, rows = reference.instances, []
     actors = (RandomActor(), GreedyActor(), GreedyActor(random_when_stuck=True))
     for name, actor in zip(BASELINES, actors, strict=False):
         progress(name)
-        rows.append(score(name, reference, rollout(actor, cases, seed=seed, max_steps=reference.max_steps)))
+        played = rollout(
+            actor,
+            cases,
+            seed=seed,
+            max_steps=reference.max_steps,
+            batch_size=TEAMS_AT_A_TIME,
+            cluster=cluster,
+        )
+        rows.append(score(name, reference, played))
     progress("PIBT*")
     return [*rows, _pibt_score(reference, seed), _expert_score(reference)]
 
@@ -227,6 +264,7 @@ def compare_lifelong(
     *,
     steps: int,
     seed: int = 0,
+    cluster: str | None = None,
     progress: Callable[[str], None] = lambda phase: None,
 ) -> tuple[dict[str, Any], list[Rollouts]]:
     """Return the throughput of a policy and of `LIFELONG_BASELINES` on the same cases as plain data.
@@ -236,13 +274,20 @@ def compare_lifelong(
     """
     rows, played = [], []
     mark = "*" if policy.config.needs_map else ""
+    settings: dict[str, Any] = {
+        "task": "lifelong",
+        "seed": seed,
+        "max_steps": steps,
+        "batch_size": TEAMS_AT_A_TIME,
+        "cluster": cluster,
+    }
     for execution in executions:
         progress(execution.name)
-        played.append(rollout(policy, instances, task="lifelong", execution=execution, seed=seed, max_steps=steps))
+        played.append(rollout(policy, instances, execution=execution, **settings))
         rows.append(_throughput(execution.name + mark, played[-1]))
     for name, actor in LIFELONG_BASELINES.items():
         progress(name)
-        rows.append(_throughput(name, rollout(actor, instances, task="lifelong", seed=seed, max_steps=steps)))
+        rows.append(_throughput(name, rollout(actor, instances, **settings)))
     return {"cases": len(instances), "steps": steps, "rows": rows}, played
 
 

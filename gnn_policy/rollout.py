@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from torch import nn
 
+from experts.cluster import connect
 from gnn_policy.acting import scores_of
 from gnn_policy.cases import Task
 from gnn_policy.execution import Execution, episode_noise, episode_seeds
@@ -105,6 +108,7 @@ def rollout(
     seed: int | Sequence[int] = 0,
     max_steps: int | Sequence[int] | npt.NDArray[np.integer] = 128,
     batch_size: int = 256,
+    cluster: str | None = None,
 ) -> Rollouts:
     """Play `instances` under a policy and the collision shield; no expert is needed.
 
@@ -122,9 +126,13 @@ def rollout(
         seed: Random seed for sampling and the shield's tie-breaking, one for all instances or one for each.
         max_steps: T_max, one for all instances or one for each.
         batch_size: Maximum number of teams to play at a time; it does not change the outcome.
+        cluster: The address of a Ray cluster whose workers play the batches, one thread each, as in
+            `experts.solve_many`; the policy must be on the CPU. `"local"` starts as many workers as `torch` has
+            threads.
 
     Raises:
-        ValueError: If an argument is out of range, or the policy needs more memory than there is for one team.
+        ValueError: If an argument is out of range, the policy needs more memory than there is for one team, or a policy
+            for a cluster is not on the CPU.
         TypeError: If `policy` is neither a network nor an actor.
     """
     instances = list(arguments.each_of(instances, Instance, "instances"))
@@ -145,9 +153,12 @@ def rollout(
     try:
         if isinstance(policy, nn.Module):
             policy.eval()
-        for chosen in _batches(instances, batch_size, task):
-            outcomes = _play(actor, [instances[i] for i in chosen], seeds[chosen], limits[chosen], settings)
-            for i, outcome in zip(chosen, outcomes, strict=True):
+        batches = list(_batches(instances, batch_size, task))
+        teams = (([instances[i] for i in chosen], seeds[chosen], limits[chosen]) for chosen in batches)
+        play = partial(_play, actor, settings)
+        outcomes = map(play, teams) if cluster is None else _on_cluster(play, teams, policy, cluster)
+        for chosen, batch in zip(batches, outcomes, strict=True):
+            for i, outcome in zip(chosen, batch, strict=True):
                 played[i] = outcome
     finally:
         if isinstance(policy, nn.Module):
@@ -224,14 +235,22 @@ class _Played:
         return _Played(instance.starts[None], instance.goals[None], 0, np.zeros(instance.num_agents, np.int64))
 
 
-def _play(
-    actor: Actor,
-    instances: Sequence[Instance],
-    seeds: npt.NDArray[np.uint64],
-    limits: npt.NDArray[np.int64],
-    settings: dict[str, Any],
-) -> list[_Played]:
+Teams = tuple[Sequence[Instance], npt.NDArray[np.uint64], npt.NDArray[np.int64]]
+"""Instances to play together, their seeds and their limits."""
+
+
+def _on_cluster(
+    play: Callable[[Teams], list[_Played]], batches: Iterable[Teams], policy: nn.Module | Actor, cluster: str
+) -> Iterator[list[_Played]]:
+    if isinstance(policy, nn.Module) and any(weight.device.type != "cpu" for weight in policy.parameters()):
+        raise ValueError('the workers of a cluster play on their CPUs: move the policy there by policy.to("cpu")')
+    with connect(cluster, workers=torch.get_num_threads()) as workers:
+        yield from workers.map(play, batches)
+
+
+def _play(actor: Actor, settings: dict[str, Any], teams: Teams) -> list[_Played]:
     """Play instances together until the last team has ended."""
+    instances, seeds, limits = teams
     lifelong = settings["task"] == "lifelong"
     env = BatchedEnv(
         len(instances),

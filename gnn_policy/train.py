@@ -145,7 +145,10 @@ def _train(config: TrainConfig, folder: Path, console: Console, process: Process
             return
         # The command line, which the run's settings agree with, has asked for its parts.
         policy = checkpoint.load(folder, plugins=tuple(config.policy.plugins.values()))
-        evaluate_and_report(on_device(policy, config.device), config, folder, console, threads=training.threads)
+        device = "cpu" if config.cluster is not None else config.device
+        evaluate_and_report(
+            on_device(policy, device), config, folder, console, threads=training.threads, cluster=config.cluster
+        )
     console.print(f"learning curve: {folder / 'learning_curve.png'}", highlight=False)
     console.print(f"policy: {folder / 'best.safetensors'}", highlight=False)
 

@@ -34,6 +34,7 @@ from tensordict import TensorDict
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
+from experts.cluster import connect
 from gnn_policy import checkpoint, metrics
 from gnn_policy.cases import Task
 from gnn_policy.command_line import on_device
@@ -126,6 +127,7 @@ class Training:
             rounds=config.expert_iterations,
             threads=self.threads,
             clock=clock,
+            cluster=config.cluster,
         )
         self._shards: list[Demonstrations] = []
         found: dict[str, Any] | None = None
@@ -148,6 +150,10 @@ class Training:
 
     def run(self) -> None:
         """Train all remaining rounds."""
+        with nullcontext() if self.config.cluster is None else connect(self.config.cluster, workers=self.threads):
+            self._run()
+
+    def _run(self) -> None:
         config, first = self.config, self.process.rank == 0
         references = self._reference_sets() if first else None
         batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
@@ -189,6 +195,7 @@ class Training:
                     timeout=config.timeout,
                     threads=self.threads,
                     nodes=config.reference_nodes,
+                    cluster=config.cluster,
                 )
         return sets
 

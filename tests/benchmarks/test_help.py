@@ -9,7 +9,7 @@ import pytest
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
-@pytest.mark.parametrize("name", ["crowds", "memory", "replay", "scale", "solvers", "speed", "training"])
+@pytest.mark.parametrize("name", ["cluster", "crowds", "memory", "replay", "scale", "solvers", "speed", "training"])
 def test_each_command_explains_itself(name: str) -> None:
     command = [sys.executable, BENCHMARKS / f"{name}.py", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)

@@ -87,7 +87,7 @@ def test_teams_without_a_plan_or_a_way_to_go_have_no_states() -> None:
 def test_bad_arguments_are_named() -> None:
     for name in ("steps", "node_limit", "rounds", "threads"):
         with pytest.raises(ValueError, match=name):
-            experts.label_plans([SWAP], **{name: 0})
+            experts.label_plans([SWAP], **{name: 0})  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="w must be"):
         experts.label_plans([SWAP], w=0.9)
     with pytest.raises(TypeError, match=r"instances\[1\] must be a mapf_env.Instance"):
