@@ -1,8 +1,10 @@
 #include "mapf_env/native/graph.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <utility>
 
 #include "mapf_env/native/random.hpp"
@@ -40,6 +42,101 @@ float least_too_far(double radius) {
 
 bool is_lost(std::uint64_t key, int receiver, int sender, double loss) {
     return uniform(mix(mix(key, receiver), sender)) < loss;
+}
+
+constexpr double infinity = std::numeric_limits<double>::infinity();
+
+double length(double down, double right) { return std::sqrt(down * down + right * right); }
+
+// The least rectangle around some cells.
+struct Box {
+    double top = infinity, bottom = -infinity, left = infinity, right = -infinity;
+
+    void add(const std::int32_t* cell) {
+        top = std::min<double>(top, cell[0]);
+        bottom = std::max<double>(bottom, cell[0]);
+        left = std::min<double>(left, cell[1]);
+        right = std::max<double>(right, cell[1]);
+    }
+
+    double distance(const Box& other) const {
+        return length(std::max({other.top - bottom, top - other.bottom, 0.0}),
+                      std::max({other.left - right, left - other.right, 0.0}));
+    }
+};
+
+// Sets of robots that are joined (Galler and Fischer 1964).
+class JoinedRobots {
+public:
+    explicit JoinedRobots(int count) : parent_(count), num_sets_(count) {
+        std::iota(parent_.begin(), parent_.end(), 0);
+    }
+
+    int num_sets() const { return num_sets_; }
+
+    int root(int i) {
+        while (parent_[i] != i) i = parent_[i] = parent_[parent_[i]];
+        return i;
+    }
+
+    void join(int i, int j) {
+        i = root(i);
+        j = root(j);
+        num_sets_ -= i != j;
+        parent_[i] = j;
+    }
+
+private:
+    std::vector<int> parent_;
+    int num_sets_;
+};
+
+// Returns true if links shorter than `radius` connect all robots. The map is cut into squares so small that all robots
+// of one hear each other and so large that none hears a robot three squares away. Robots of two squares are compared only
+// if nothing has joined these yet.
+bool is_connected(const std::int32_t* positions, int num_agents, double radius) {
+    struct Square {
+        std::array<double, 2> place;
+        std::size_t begin, end;  // of its robots
+        Box box;
+    };
+    const double side = std::max(std::floor(radius / 1.42), 1.0);
+    std::vector<std::pair<std::array<double, 2>, int>> robots(num_agents);
+    for (int i = 0; i < num_agents; ++i)
+        robots[i] = {{std::floor(positions[2 * i] / side), std::floor(positions[2 * i + 1] / side)}, i};
+    std::sort(robots.begin(), robots.end());
+    JoinedRobots joined(num_agents);
+    std::vector<Square> squares;
+    for (std::size_t k = 0; k < robots.size(); ++k) {
+        if (k == 0 || robots[k].first != squares.back().place) squares.push_back({robots[k].first, k, k, {}});
+        Square& square = squares.back();
+        square.box.add(positions + 2 * robots[k].second);
+        square.end = k + 1;
+        joined.join(robots[k].second, robots[square.begin].second);
+    }
+    const auto compare = [&](const Square& one, const Square& other) {
+        if (joined.root(robots[one.begin].second) == joined.root(robots[other.begin].second)) return;
+        if (!(one.box.distance(other.box) < radius)) return;
+        for (std::size_t a = one.begin; a < one.end; ++a)
+            for (std::size_t b = other.begin; b < other.end; ++b) {
+                const int i = robots[a].second, j = robots[b].second;
+                const double down = positions[2 * i] - static_cast<double>(positions[2 * j]);
+                const double right = positions[2 * i + 1] - static_cast<double>(positions[2 * j + 1]);
+                if (length(down, right) < radius) return joined.join(i, j);
+            }
+    };
+    constexpr std::array<std::array<int, 2>, 12> ahead{
+        {{0, 1}, {1, 0}, {1, 1}, {1, -1}, {0, 2}, {2, 0}, {1, 2}, {2, 1}, {1, -2}, {2, -1}, {2, 2}, {2, -2}}};
+    for (const auto& [down, right] : ahead) {
+        for (const Square& square : squares) {
+            const std::array<double, 2> place{square.place[0] + down, square.place[1] + right};
+            const auto other = std::lower_bound(squares.begin(), squares.end(), place,
+                                                [](const Square& each, const auto& key) { return each.place < key; });
+            if (other != squares.end() && other->place == place) compare(square, *other);
+        }
+        if (joined.num_sets() == 1) return true;
+    }
+    return false;
 }
 
 }  // namespace
@@ -113,28 +210,16 @@ void lose_messages(int num_agents, double loss, std::uint64_t key, int stride, f
 }
 
 double connecting_radius(const std::int32_t* positions, int num_agents, double radius) {
-    // The longest edge of the shortest spanning tree (Prim 1957) is what the radius has to exceed.
-    std::vector<double> gap(num_agents, std::numeric_limits<double>::infinity());
-    std::vector<bool> joined(num_agents, false);
-    double longest = 0.0;
-    int newest = 0;
-    for (int size = 1; size < num_agents; ++size) {
-        joined[newest] = true;
-        int closest = -1;
-        for (int i = 0; i < num_agents; ++i) {
-            if (joined[i]) continue;
-            const double down = positions[2 * i] - positions[2 * newest];
-            const double right = positions[2 * i + 1] - positions[2 * newest + 1];
-            gap[i] = std::min(gap[i], down * down + right * right);
-            if (closest < 0 || gap[i] < gap[closest]) closest = i;
-        }
-        longest = std::max(longest, gap[closest]);
-        newest = closest;
-    }
-    const double infinity = std::numeric_limits<double>::infinity();
-    while (num_agents > 1 && !(std::sqrt(longest) < radius))
-        radius = std::max(radius * 1.1, std::nextafter(radius, infinity));  // the smallest numbers times 1.1 are themselves
-    return radius;
+    if (num_agents < 2) return radius;
+    Box team;
+    for (int i = 0; i < num_agents; ++i) team.add(positions + 2 * i);
+    const double longest = length(team.bottom - team.top, team.right - team.left);  // of all links at most
+    std::vector<double> radii{radius};
+    while (!(longest < radii.back()))  // the smallest numbers times 1.1 are themselves
+        radii.push_back(std::max(radii.back() * 1.1, std::nextafter(radii.back(), infinity)));
+    return *std::partition_point(radii.begin(), radii.end() - 1, [&](double each) {
+        return !is_connected(positions, num_agents, each);
+    });
 }
 
 }  // namespace mapf

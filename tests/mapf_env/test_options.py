@@ -354,6 +354,29 @@ def test_the_connecting_radius_is_the_least_that_connects(
     assert rules.connecting_radius(np.array(crowd[1], np.int32), start) == expected
 
 
+@given(strategies.seeds, st.integers(2, 300), st.integers(1, 8), st.floats(1, 400), st.floats(0.1, 9))
+def test_crowds_far_apart_are_connected_by_the_longest_link_of_the_shortest_tree(
+    seed: int, robots: int, crowds: int, spread: float, start: float
+) -> None:
+    generator = np.random.default_rng(seed)
+    centres = generator.integers(0, 3000, (crowds, 2))
+    cells = centres[generator.integers(crowds, size=robots)] + generator.normal(0, spread, (robots, 2))
+    positions = np.unique(cells.clip(0, 10_000).astype(np.int32), axis=0)
+    generator.shuffle(positions)
+    square = ((positions[:, None].astype(np.int64) - positions) ** 2).sum(axis=2)
+    outside, gap, longest = np.ones(len(positions), np.bool_), square[0].copy(), 0
+    outside[0] = False
+    while outside.any():  # the tree grows by its nearest robot
+        nearest = np.flatnonzero(outside)[gap[outside].argmin()]
+        longest = max(longest, int(gap[nearest]))
+        outside[nearest] = False
+        gap = np.minimum(gap, square[nearest])
+    expected = start
+    while len(positions) > 1 and not math.sqrt(longest) < expected:
+        expected *= 1.1
+    assert rules.connecting_radius(positions, start) == expected
+
+
 def test_the_smallest_radius_grows_too() -> None:
     assert 1 < rules.connecting_radius(np.array([[0, 0], [0, 1]], np.int32), 5e-324) < 1.1
 
