@@ -12,6 +12,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from itertools import islice
 from typing import Any, TypeVar
@@ -35,8 +36,8 @@ class Workers:
     def __init__(self) -> None:
         import ray
 
-        self._ray = ray
-        self._call: Any = ray.remote(num_cpus=1, max_retries=MOST_RETRIES, retry_exceptions=False)(_call)
+        self._ray: Any = ray
+        self._call = _remote_call(MOST_RETRIES)
         self.count = max(int(ray.cluster_resources().get("CPU", 1)), 1)
         """Number of parts that are computed at the same time: the cluster's cores at the time of the connection."""
 
@@ -164,6 +165,14 @@ def _ray(address: str) -> Any:
 
         ray_constants.ENABLE_RAY_CLUSTER = False  # for a Ray that was imported before the variable was set
     return ray
+
+
+@cache
+def _remote_call(retries: int) -> Any:
+    """Return `_call` as Ray's workers call it: one object for all connections, since each is sent to all workers."""
+    import ray
+
+    return ray.remote(num_cpus=1, max_retries=retries, retry_exceptions=False)(_call)
 
 
 def _call(function: Callable[[T], R], part: T, caller: str) -> R:

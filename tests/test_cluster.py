@@ -227,16 +227,3 @@ def test_ray_is_imported_only_for_a_cluster_and_missed_in_words() -> None:
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
     assert 'pip install "mapf-env[cluster]"' in done.stdout
-
-
-def test_an_address_must_be_a_word() -> None:
-    for call in (
-        experts.solve_many,
-        experts.label_plans,
-        experts.next_moves,
-        partial(experts.relabel, positions=INSTANCES[0].starts[None]),
-    ):
-        with pytest.raises(ValueError, match="cluster must be the address of a Ray cluster"):
-            call(INSTANCES[:1], cluster="")
-        with pytest.raises(TypeError, match="cluster must be a str, got int"):
-            call(INSTANCES[:1], cluster=5)  # pyright: ignore[reportArgumentType]

@@ -40,6 +40,7 @@ MANY = LIMITS | {
     "w": (*but(FACTOR, NoneType), float("inf")),
     "threads": (*COUNT, 1025),
     "progress": but(OBJECT, NoneType),
+    "cluster": (*but(STRING, NoneType), ""),
 }
 ONE = {"instance": INSTANCE}
 CALLS: dict[str, Any] = {
@@ -62,6 +63,19 @@ CALLS: dict[str, Any] = {
             "rounds": COUNT,
             "threads": MANY["threads"],
             "seed": LIMITS["seed"],
+            "cluster": MANY["cluster"],
+        },
+    ),
+    "next_moves": (
+        experts.next_moves,
+        {"instances": [INSTANCE]},
+        {
+            "instances": (*SEVERAL, INSTANCE),
+            "window": (*COUNT, 1001),
+            "rounds": COUNT,
+            "threads": MANY["threads"],
+            "seed": LIMITS["seed"],
+            "cluster": MANY["cluster"],
         },
     ),
     "solve_many": (experts.solve_many, {"instances": [INSTANCE]}, MANY),
@@ -80,6 +94,7 @@ CALLS: dict[str, Any] = {
             "node_limit": COUNT,
             "threads": COUNT,
             "seed": LIMITS["seed"],
+            "cluster": MANY["cluster"],
         },
     ),
     "Result.of": (

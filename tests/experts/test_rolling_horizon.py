@@ -125,6 +125,6 @@ def test_bad_arguments_of_next_moves_are_named() -> None:
     instance = random_instance(seed=0)
     for name in ("window", "rounds", "threads"):
         with pytest.raises(ValueError, match=name):
-            experts.next_moves([instance], **{name: 0})
+            experts.next_moves([instance], **{name: 0})  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"instances\[1\] must be a mapf_env.Instance"):
         experts.next_moves([instance, 3])  # pyright: ignore[reportArgumentType]

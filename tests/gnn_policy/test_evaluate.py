@@ -30,6 +30,7 @@ CONFIG = TrainConfig(
 CHANGES = """
     --num-agents 2 5 --maps 2 --cases-per-map 3 --height 7 --width 8 --density 0.2 --styles walls --data-seed 9 --w 1.5
     --timeout 4 --seed 6 --threads 1 --executions stuck,0.5 argmax,pibt,connected --failures 2
+    --cluster local
 """
 
 
@@ -102,6 +103,7 @@ def test_every_option_reaches_the_evaluation(file, monkeypatch, tmp_path, split)
         "whole": False,
         "threads": 1,
         "failures": 2,
+        "cluster": "local",
     }
     assert torch.get_num_threads() == 1
     assert folder == tmp_path / "out"
