@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from gnn_policy.execution import Execution, alarmed
+from gnn_policy.execution import Execution, Flags, alarmed
 from gnn_policy.policy_config import PolicyConfig
 from mapf_env import Action, Bag, Observation
 
@@ -62,21 +62,45 @@ def logits_of(policy: nn.Module, bag: Bag) -> Scores:
         return policy(tensors(bag, device))[:count].float().cpu().numpy()
 
 
-def scores_of(policy: nn.Module, bag: Bag, execution: Execution, noise: Any) -> Scores:
-    """Return the scores (M, 5) of the moves of a bag's robots; `noise` is that of `Execution.scores`.
+class Facts(NamedTuple):
+    """Facts about M robots that an execution reads itself."""
+
+    alarmed: Flags
+    """(M,) they are stuck or, except for "fallback", hear a robot that is; nobody for executions that do not ask."""
+    greedy: Flags | None
+    """(M, 5) the moves that shorten each robot's path, for "fallback"."""
+    jammed: Flags | None
+    """(M,) they made no progress for many steps, for "fallback"."""
+
+
+def facts_of(bag: Bag, execution: Execution, config: PolicyConfig) -> Facts:
+    """Return the facts about a bag's robots that an execution reads.
+
+    Raises:
+        ValueError: If the bag does not say them.
+    """
+    facts = execution.facts(np.asarray(bag.scalars), config)
+    alarm = np.zeros(len(bag.team), np.bool_)
+    if "stuck" in facts:
+        alarm = facts["stuck"][:, 0]
+        if execution.actions == "stuck" and config.taps > 1:  # with one tap robots do not communicate
+            alarm = alarmed(alarm, np.asarray(bag.edge_index))
+    return Facts(alarm, facts.get("greedy_moves"), facts["jammed"][:, 0] if "jammed" in facts else None)
+
+
+def scores_of(
+    policy: nn.Module, bag: Bag, execution: Execution, noise: Any, exploration: float | None = None
+) -> Scores:
+    """Return the scores (M, 5) of the moves of a bag's robots; `Execution.scores` says what the last two are.
 
     Raises:
         ValueError: If the bag does not say what the execution reads, such as which robots are stuck.
     """
     config: PolicyConfig = policy.config  # pyright: ignore[reportAssignmentType]
-    facts = execution.facts(bag.scalars, config)
-    alarm = np.zeros(len(bag.team), np.bool_)
-    if "stuck" in facts:
-        alarm = facts["stuck"][:, 0]
-        if execution.actions == "stuck" and config.taps > 1:  # with one tap robots do not communicate
-            alarm = alarmed(alarm, bag.edge_index)
-    jammed = facts["jammed"][:, 0] if "jammed" in facts else None
-    return execution.scores(logits_of(policy, bag), alarm, noise, facts.get("greedy_moves"), jammed)
+    facts = facts_of(bag, execution, config)
+    return execution.scores(
+        logits_of(policy, bag), facts.alarmed, noise, facts.greedy, facts.jammed, exploration=exploration
+    )
 
 
 def act(policy: nn.Module, observation: Any, execution: Execution, rng: np.random.Generator) -> Any:

@@ -18,6 +18,7 @@ from mapf_env.arguments import known_settings, lists_settings, share
 from mapf_env.files import write_whole
 from mapf_env.generation import MapStyle
 
+Objective = Literal["imitation", "delay"]
 RobotOrder = Literal["index", "random", "farthest", "nearest"]
 Aggregation = Literal["visited", "failed", "plans"]
 Backend = Literal["direct", "process"]
@@ -86,6 +87,15 @@ class TrainConfig:
     expert_iterations: int = 400
     """Rounds of the neighbourhood search that improves LaCAM's plans in an aggregation of "plans"; more rounds give
     cheaper plans and take longer."""
+
+    objective: Objective = "imitation"
+    """"imitation" of the expert; or "delay", for a policy that has learned to imitate (`init`): reinforcement learning
+    from the steps that robots lose, with no expert. A round then plays `dagger_steps` team steps and fits them twice in
+    batches of `batch_size` states."""
+    discount: float = 0.95
+    """Weight of what is lost one step later, for the objective "delay"."""
+    neighbour_share: float = 0.5
+    """Weight of what a robot next to oneself loses, for the objective "delay"."""
 
     rounds: int = 150
     """Rounds of collecting and fitting; round 0 imitates the expert, the others aggregate what the policy visits."""
@@ -185,7 +195,7 @@ class TrainConfig:
         for name in ("dagger_every", "weight_decay", "seed", "data_seed", "threads"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)}")
-        for name in ("density", "beta_decay", "fresh_share"):
+        for name in ("density", "beta_decay", "fresh_share", "discount"):
             share(getattr(self, name), name)
         for name in ("beta1", "averaging"):
             if (value := getattr(self, name)) is not None and not 0 <= value < 1:
@@ -202,6 +212,12 @@ class TrainConfig:
         for name in ("seed", "data_seed"):
             if getattr(self, name) >= 2**64:
                 raise ValueError(f"{name} must be below 2**64, got {getattr(self, name)}")
+        if not 0 <= self.neighbour_share < math.inf:
+            raise ValueError(f"neighbour_share must be finite and not negative, got {self.neighbour_share}")
+        if self.objective == "delay" and self.rollout_actions == "sampled":
+            raise ValueError(
+                'the objective "delay" needs robots that do not sample: rollout_actions "argmax", "stuck" or "fallback"'
+            )
         if self.backend == "direct" and self.collectors > 1:
             raise ValueError(f'{self.collectors} collectors need processes of their own: backend "process"')
         if not 1 <= self.w < math.inf:

@@ -48,9 +48,11 @@ class Mixture(TensorDictModuleBase):
         config: TrainConfig,
         cases: Cases,
         task: Task = "one_shot",
+        exploration: float | None = None,
     ) -> None:
         super().__init__()
         self.policy, self.labeller, self.config, self.task = policy, labeller, config, task
+        self.exploration = exploration
         self._map_of = cases.map_of
         self._senses = config.rollout_execution.senses(config.policy)
         self._maps = MapSet(cases.grids, self._senses.fov_radius, "uint8")
@@ -100,7 +102,7 @@ class Mixture(TensorDictModuleBase):
         robot = np.arange(states.num_robots) - states.offsets[team]
         noise = episode_noise(states.seeds[team], states.times[team], robot)
         with autocast(self.config.precision, self.policy.head.weight.device):
-            return scores_of(self.policy, bag, self.config.rollout_execution, noise)
+            return scores_of(self.policy, bag, self.config.rollout_execution, noise, self.exploration)
 
 
 def _collector(
@@ -129,7 +131,7 @@ def teams_side_by_side(config: TrainConfig, process: Process) -> int:
     return teams
 
 
-def _split_teams(teams: int, by_task: Mapping[Task, Cases], collectors: int) -> dict[Task, int]:
+def split_teams(teams: int, by_task: Mapping[Task, Cases], collectors: int) -> dict[Task, int]:
     """Return the teams of each task, in proportion to its cases and at least one for each collector.
 
     Raises:
@@ -147,16 +149,25 @@ def _split_teams(teams: int, by_task: Mapping[Task, Cases], collectors: int) -> 
     return {"one_shot": (each - share) * collectors, "lifelong": share * collectors}
 
 
-class _Player:
+class Player:
     """Plays the cases of one task through a TorchRL collector."""
 
     def __init__(
-        self, config: TrainConfig, policy: DecentralizedPolicy, labeller: Labeller, task: Task, cases: Cases, teams: int
+        self,
+        config: TrainConfig,
+        policy: DecentralizedPolicy,
+        labeller: Labeller,
+        task: Task,
+        cases: Cases,
+        teams: int,
+        *,
+        exploration: float | None = None,
+        reward: str = "flowtime",
     ) -> None:
         self.task: Task = task
         self.cases, self.teams = cases, teams
         self._config = config
-        self._mixture = Mixture(policy, labeller, config, cases, task)
+        self._mixture = Mixture(policy, labeller, config, cases, task, exploration)
         self._mixture.begin(beta=1.0, seed=0)
         make_env = functools.partial(
             TeamEnv,
@@ -166,6 +177,7 @@ class _Player:
             task=task,
             max_cycles=config.rollout_length,
             dtype="uint8",
+            reward=reward,
             **config.rollout_execution.env_settings(config.policy),
         )
         self._collector = _collector(
@@ -179,21 +191,26 @@ class _Player:
         )
         self._batches: Iterator[TensorDictBase] = iter(self._collector)
 
+    def begin(self, beta: float, seed: int) -> None:
+        """Set the share of the expert, and the seed of all draws from now on; take over the policy's weights."""
+        self._mixture.begin(beta, seed)
+        if self._config.backend != "direct":
+            self._collector.update_policy_weights_(self._mixture)
+        self._collector.set_seed(seed)
+
+    def visit(self) -> TensorDictBase:
+        """Play the teams from their starts (teams, rollout_length); the next call writes over what is returned."""
+        return next(self._batches).reshape(-1, self._config.rollout_length)  # collectors side by side are stacked
+
     def play(self, beta: float, seed: int, times: int, mining: int, *, only_failed: bool) -> States:
         """Play the teams `times` times for each one that is kept, and return the states of those.
 
         With `mining` above 1 the one in so many is kept that arrived last. With `only_failed` only the last states of
         teams that did not arrive are returned.
         """
-        self._mixture.begin(beta, seed)
-        if self._config.backend != "direct":
-            self._collector.update_policy_weights_(self._mixture)
-        self._collector.set_seed(seed)
-        parts: list[TensorDictBase] = []
-        for _ in range(mining * times):
-            # Collectors side by side are stacked.
-            visited = next(self._batches).reshape(-1, self._config.rollout_length)
-            parts.append(visited.select(*STATE_KEYS, ("next", "truncated"), ("next", "terminated")).clone())
+        self.begin(beta, seed)
+        keys = (*STATE_KEYS, ("next", "truncated"), ("next", "terminated"))
+        parts = [self.visit().select(*keys).clone() for _ in range(mining * times)]
         played: Any = torch.cat(parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
         arrived = np.asarray(played["next", "terminated"]).reshape(len(played), -1).any(axis=1)
         teams = np.sort(arrived.argsort(kind="stable")[: len(played) // mining])
@@ -221,8 +238,8 @@ class Demonstrator:
         self._config, self._labeller = config, labeller
         self._rank, self._num_processes = process.rank, process.count
         by_task = cases.by_task()
-        teams = _split_teams(teams_side_by_side(config, process), by_task, config.collectors)
-        self._players = [_Player(config, policy, labeller, task, own, teams[task]) for task, own in by_task.items()]
+        teams = split_teams(teams_side_by_side(config, process), by_task, config.collectors)
+        self._players = [Player(config, policy, labeller, task, own, teams[task]) for task, own in by_task.items()]
 
     def collect(self, round_number: int, steps: int) -> tuple[Demonstrations, int]:
         """Play this process's share of at least `steps` team steps and label them.
@@ -260,7 +277,7 @@ class Demonstrator:
         asked = np.random.default_rng(seed).choice(len(states), count, replace=False, p=weight / weight.sum())
         return self._labeller.demonstrate(states.take(np.sort(asked)), config.plan_steps)
 
-    def _starts(self, player: _Player, steps: int, rng: np.random.Generator) -> States:
+    def _starts(self, player: Player, steps: int, rng: np.random.Generator) -> States:
         """Return the starts of as many cases as have plans of about the player's share of so many steps."""
         config, cases = self._config, player.cases
         teams = sum(each.teams for each in self._players)

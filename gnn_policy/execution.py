@@ -73,6 +73,8 @@ class Execution:
         noise: Callable[[Flags], Logits],
         greedy: Flags | None = None,
         jammed: Flags | None = None,
+        *,
+        exploration: float | None = None,
     ) -> Logits:
         """Return a score for each move; the greatest is taken, and PIBT takes their order.
 
@@ -85,6 +87,7 @@ class Execution:
             noise: Returns Gumbel noise (m, 5) for the m robots that a mask (M,) selects.
             greedy: (M, 5) the moves that shorten each robot's path, which "fallback" reads.
             jammed: (M,) robots that made no progress for many steps, which "fallback" reads.
+            exploration: If given, all other robots sample, too, at this temperature, as in reinforcement learning.
 
         Raises:
             ValueError: If a logit, or a logit over the temperature, is not finite, or "fallback" lacks its inputs.
@@ -94,12 +97,14 @@ class Execution:
                 "the policy's logits are not finite: its weights or what it observes are damaged, or its training "
                 "diverged; train it again with a smaller lr"
             )
-        draws = {"argmax": np.zeros_like(alarmed), "sampled": np.ones_like(alarmed)}.get(self.actions, alarmed)
-        if not draws.any():
+        draws = self.draws(alarmed)
+        if exploration is None and not draws.any():
             return logits
         scores = logits.copy()
         with np.errstate(all="ignore"):
             scores[draws] = logits[draws] / self.temperature + noise(draws)
+            if exploration is not None:
+                scores[~draws] = logits[~draws] / exploration + noise(~draws)
         if not np.isfinite(scores).all():
             raise ValueError(f"the logits over a temperature of {self.temperature} are not finite: give a higher one")
         if self.actions == "fallback":
@@ -110,6 +115,10 @@ class Execution:
             weight = np.where(jammed[draws], _JAMMED, _TIER)[:, None]
             scores[draws] = scores[draws].clip(-_TIER / 3, _TIER / 3) + weight * tier
         return scores
+
+    def draws(self, alarmed: Flags) -> Flags:
+        """Return which of M robots sample; `alarmed` is that of `scores`."""
+        return {"argmax": np.zeros_like(alarmed), "sampled": np.ones_like(alarmed)}.get(self.actions, alarmed)
 
     @property
     def features(self) -> tuple[str, ...]:

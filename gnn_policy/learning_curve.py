@@ -28,13 +28,14 @@ class Round:
     fit_seconds: float
     """Time of this round's gradient steps."""
     loss: float
-    """Mean cross-entropy of this round."""
+    """Mean cross-entropy of this round; for the objective "delay" the share of steps that robots lost."""
     accuracy: float
-    """Share of the expert's moves that the policy would make; it falls as aggregation adds hard states."""
+    """Share of the expert's moves, or of those that were drawn in rollouts, that the policy would make; it falls as
+    aggregation adds hard states."""
     lr: float
     """Learning rate of this round."""
     demonstrations: int
-    """Labelled team states so far."""
+    """Labelled team states so far; for the objective "delay" those of this round."""
     unlabelled: int
     """States of this round that the expert did not solve."""
     validation_success: float | None = None

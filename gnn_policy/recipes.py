@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from gnn_policy.cases import Family
+from gnn_policy.cases import Family, Task
 from gnn_policy.config import TrainConfig
 from gnn_policy.execution import Execution
 from gnn_policy.policy_config import PolicyConfig
 
-Recipe = Literal["quick", "full", "paper", "general"]
+Recipe = Literal["quick", "full", "paper", "general", "refine"]
 
 _QUICK = TrainConfig(
     policy=PolicyConfig(encoder="lean"),
@@ -96,6 +96,28 @@ _GENERAL = TrainConfig(
     validate_every=10,
 )
 
+_TASKS: tuple[Task, ...] = ("one_shot", "lifelong")
+_REFINE = replace(
+    _GENERAL,
+    init="general",
+    objective="delay",
+    families=tuple(replace(each, task=task) for each in _GENERAL.families for task in _TASKS),
+    rounds=200,
+    updates_per_round=None,
+    batch_robots=None,
+    batch_size=112,
+    dagger_steps=2304,
+    rollout_teams=24,
+    rollout_length=96,
+    augment=False,
+    lr=3e-4,
+    final_lr=2e-5,
+    weight_decay=0.0,
+    clip_norm=0.5,
+    averaging=0.995,
+    validate_every=20,
+)
+
 RECIPES: dict[Recipe, TrainConfig] = {
     "quick": _QUICK,
     "full": replace(
@@ -111,6 +133,8 @@ RECIPES: dict[Recipe, TrainConfig] = {
     ),
     "paper": TrainConfig(),
     "general": _GENERAL,
+    "refine": _REFINE,
 }
 """A policy in about ten minutes on two CPU cores; the packaged models of the paper; the paper's own settings; and the
-general policy, for any map and crowds of robots, in six or seven hours (an hour with `--rounds 90`)."""
+general policy, for any map and crowds of robots, in six or seven hours (an hour with `--rounds 90`); and its refinement
+by reinforcement learning, one-shot and lifelong, in an hour and a half."""

@@ -38,7 +38,7 @@ class Command:
     recipe: Recipe = "quick"
     """Which set of defaults the other options start from: "quick" takes about ten minutes on two CPU cores, "full" made
     the paper's models that come with the package, "paper" is the paper's setup, "general" makes the policy for any map
-    and crowds of robots in hours."""
+    and crowds of robots in hours, "refine" improves one that exists by reinforcement learning."""
     file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
     """A file of settings, such as the config.toml of another run, instead of a recipe; missing settings have the
     defaults of "paper"."""
@@ -64,8 +64,10 @@ def parse(arguments: Sequence[str], prog: str = PROG) -> Command:
     chosen, _ = tyro.cli(_Defaults, args=arguments, return_unknown_args=True, add_help=False, prog=prog)
     config = RECIPES[chosen.recipe] if chosen.file is None else TrainConfig.load(chosen.file)
     if chosen.init is not None:  # a file of settings with `init` has the policy and execution that belong to it
+        execution = checkpoint.executed_as(chosen.init)
+        rollouts = execution.actions if config.objective == "delay" else config.rollout_actions
         config = replace(
-            config, policy=checkpoint.config_of(chosen.init), execution=checkpoint.executed_as(chosen.init)
+            config, policy=checkpoint.config_of(chosen.init), execution=execution, rollout_actions=rollouts
         )
     command = parse_options(Command, arguments, default=Command(config, chosen.recipe, chosen.file), prog=prog)
     _refuse_unused(command.config, config)

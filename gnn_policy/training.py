@@ -1,5 +1,7 @@
 """The one training loop: collect, label, aggregate, fit, validate; round after round, resumable after each.
 
+For the objective "delay" a round collects what the policy does, and fits that; nothing is labelled or kept.
+
 A run folder holds
     config.toml                  the settings
     demonstrations/round_*.safetensors  labelled states, one file for each round of collection
@@ -51,10 +53,13 @@ from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
 from gnn_policy.processes import Process
 from gnn_policy.progress import TrainingProgress
+from gnn_policy.reinforcement import EPOCHS, Critic, Explorer, loss_of
 from gnn_policy.rollout import rollout
 from gnn_policy.run_folder import lock_run, open_run
 from mapf_env.files import replacing
 
+CRITIC_LR, CRITIC_ROUNDS = 1e-3, 3
+"""The critic's learning rate, and the rounds in which it learns alone."""
 References = dict[Task, metrics.ReferenceSet]
 """The validation cases of each task."""
 
@@ -86,6 +91,10 @@ class Training:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.config, self.folder, self.progress, self.process = config, folder, progress, process
+        if config.objective == "delay" and process.count > 1:
+            raise ValueError(
+                f'the objective "delay" trains in one process, got {process.count}: start it without torchrun'
+            )
         process.share("batch_size", config.batch_size)
         teams_side_by_side(config, process)
         self.threads = cpu_threads(config.threads, process.local_count)
@@ -103,9 +112,13 @@ class Training:
             else None
         )
         self._player = self.policy if self._averaged is None else cast(DecentralizedPolicy, self._averaged.module)
+        self.critic = Critic(config.policy.features).to(self.policy.head.weight.device)
         optimizer = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[config.optimizer]
+        parameters: list[dict[str, Any]] = [{"params": self.policy.parameters()}]
+        if config.objective == "delay":
+            parameters.append({"params": self.critic.parameters(), "lr": CRITIC_LR})
         self.optimizer = optimizer(
-            self.policy.parameters(),
+            parameters,
             lr=config.lr,
             betas=(config.beta1, 0.999),
             weight_decay=config.weight_decay,
@@ -157,13 +170,28 @@ class Training:
         config, first = self.config, self.process.rank == 0
         references = self._reference_sets() if first else None
         batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
-        demonstrator = Demonstrator(config, self._player, self._labeller, self._cases, self.process)
+        collector = (
+            Explorer(config, self.policy, self.critic, self._labeller, self._cases)
+            if config.objective == "delay"
+            else Demonstrator(config, self._player, self._labeller, self._cases, self.process)
+        )
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
             for number in range(len(self.history), config.rounds):
-                row = self._run_round(number, demonstrator, batches, references)
+                row = (
+                    self._explore_and_fit(number, collector)
+                    if isinstance(collector, Explorer)
+                    else self._demonstrate_and_fit(number, collector, batches)
+                )
+                self.scheduler.step()
+                if references is not None and (
+                    (number + 1) % config.validate_every == 0 or number + 1 == config.rounds
+                ):
+                    self.progress.phase(number, "validation")
+                    self._validate(row, references)
+                row.seconds = self._seconds_before + self._clock() - self._began
                 self.history.append(row)
                 if writer is not None:
                     for name, value in asdict(row).items():
@@ -174,7 +202,7 @@ class Training:
                 self.progress.finished(row)
         finally:
             torch.set_flush_denormal(False)
-            demonstrator.close()
+            collector.close()
             if self._halves is not None:
                 self._halves.close()
             torch.set_num_threads(self.threads)  # and give back more than they took
@@ -199,9 +227,58 @@ class Training:
                 )
         return sets
 
-    def _run_round(
-        self, number: int, demonstrator: Demonstrator, batches: BatchMaker, references: References | None
-    ) -> Round:
+    def _explore_and_fit(self, number: int, explorer: Explorer) -> Round:
+        config, began = self.config, self._clock()
+        self.progress.phase(number, "collecting")
+        collected = explorer.collect(number, config.dagger_steps)
+        between = self._clock()
+        rng = np.random.default_rng([config.seed, number])
+        learns, learned = number >= CRITIC_ROUNDS, []
+        robots = 0
+        updates = EPOCHS * sum(-(-len(each.states) // config.batch_size) for each in collected)
+        for experience in [each for each in collected for _ in range(EPOCHS)]:
+            for bag, rows in explorer.batches(experience, rng):
+                with autocast(config.precision, self.policy.head.weight.device):
+                    outcome = loss_of(self.policy, self.critic, bag, experience, rows)
+                self.optimizer.zero_grad()
+                outcome.loss.backward()
+                if not learns:
+                    self.policy.zero_grad()
+                self._step()
+                learned.append([outcome.loss.item(), outcome.kept.item()])
+                robots += len(rows)
+                if self.progress.due() or len(learned) == updates:
+                    self.progress.fitted(number, len(learned), updates, np.array(learned)[:, 0], robots)
+        try:
+            self._require_finite()
+        except ValueError as damage:
+            raise self._diverged(number, str(damage)) from damage
+        states = sum(len(each.states) for each in collected)
+        return self._row(
+            updates=updates,
+            samples=robots,
+            collect_seconds=between - began,
+            expert_seconds=0.0,
+            fit_seconds=self._clock() - between,
+            loss=sum(each.lost * len(each.states) for each in collected) / states,
+            accuracy=float(np.mean(learned, axis=0)[1]),
+            demonstrations=states,
+            unlabelled=0,
+        )
+
+    def _row(self, *, updates: int, samples: int, **figures: Any) -> Round:
+        """Return the row of the round after those of the history."""
+        previous = self.history[-1] if self.history else None
+        return Round(
+            round=len(self.history),
+            updates=updates + (previous.updates if previous else 0),
+            samples=samples + (previous.samples if previous else 0),
+            seconds=0.0,
+            lr=float(self.scheduler.get_last_lr()[0]),
+            **figures,
+        )
+
+    def _demonstrate_and_fit(self, number: int, demonstrator: Demonstrator, batches: BatchMaker) -> Round:
         config = self.config
         began, expert_seconds, unlabelled = self._clock(), self._labeller.seconds, 0
         if self._collects(number):
@@ -221,33 +298,21 @@ class Training:
         if len(demonstrations) == 0:
             raise ValueError("the expert solved none of the visited states: raise expert_nodes or make cases easier")
         between = self._clock()
-        lr = float(self.scheduler.get_last_lr()[0])
         if self._halves is not None:
             torch.set_num_threads(self._halves.threads)
         loss, accuracy, updates, samples = self._fit(number, demonstrations, batches)
         torch.set_num_threads(self.threads)
-        self.scheduler.step()
-        done = self._clock()
-        previous = self.history[-1] if self.history else None
-        row = Round(
-            round=number,
-            updates=updates + (previous.updates if previous else 0),
-            samples=samples + (previous.samples if previous else 0),
-            seconds=0.0,
+        return self._row(
+            updates=updates,
+            samples=samples,
             collect_seconds=between - began,
             expert_seconds=self._labeller.seconds - expert_seconds,
-            fit_seconds=done - between,
+            fit_seconds=self._clock() - between,
             loss=loss,
             accuracy=accuracy,
-            lr=lr,
             demonstrations=len(demonstrations),
             unlabelled=unlabelled,
         )
-        if references is not None and ((number + 1) % config.validate_every == 0 or number + 1 == config.rounds):
-            self.progress.phase(number, "validation")
-            self._validate(row, references)
-        row.seconds = self._seconds_before + self._clock() - self._began
-        return row
 
     def _kept_shards(self) -> list[Demonstrations]:
         """Read the demonstrations of the rounds so far, as far back as they are kept."""
@@ -260,6 +325,8 @@ class Training:
 
     def _collects(self, number: int) -> bool:
         every = self.config.dagger_every
+        if self.config.objective == "delay":
+            return False
         return number == 0 or (every > 0 and number % every == 0)
 
     def _fit(self, number: int, demonstrations: Demonstrations, batches: BatchMaker) -> tuple[float, float, int, int]:
@@ -275,11 +342,7 @@ class Training:
         robots = 0
         for update, parts in enumerate(batches.batches(demonstrations, draws, rng, ahead=figures.device.type != "cpu")):
             figures[update] = self._backward([part.to(figures.device) for part in parts])
-            if config.clip_norm is not None:
-                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), config.clip_norm)
-            self.optimizer.step()
-            if self._averaged is not None:
-                self._averaged.update_parameters(self.policy)
+            self._step()
             robots += sum(len(part[EXPERT_ACTION]) for part in parts)
             if self.progress.due() or update + 1 == updates:
                 losses = figures[: update + 1, 0].cpu().numpy()
@@ -306,6 +369,14 @@ class Training:
         self.optimizer.zero_grad()
         outcome["loss_imitation"].backward()
         return torch.stack([outcome["loss_imitation"].detach(), outcome["accuracy"]])
+
+    def _step(self) -> None:
+        """Change the weights by their gradients."""
+        if self.config.clip_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.clip_norm)
+        self.optimizer.step()
+        if self._averaged is not None:
+            self._averaged.update_parameters(self.policy)
 
     def _require_finite(self) -> None:
         """Check the weights, the batch statistics and the optimiser's moments."""
@@ -381,6 +452,7 @@ class Training:
         state = {
             "processes": self.process.count,
             "policy": self.policy.state_dict(),
+            "critic": self.critic.state_dict(),
             "averaged": None if self._averaged is None else self._averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "scheduler": self.scheduler.state_dict(),
@@ -409,6 +481,7 @@ class Training:
         try:
             processes = state["processes"]
             self.policy.load_state_dict(state["policy"])
+            self.critic.load_state_dict(state["critic"])
             if self._averaged is not None:
                 self._averaged.load_state_dict(state["averaged"])
             self.optimizer.load_state_dict(state["optimizer"])

@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from gnn_policy import Execution, PolicyConfig, load, results_json, train
+from gnn_policy import Execution, PolicyConfig, checkpoint, load, results_json, train
 from gnn_policy.config import TrainConfig
 from gnn_policy.recipes import RECIPES
 from mapf_env import save_map
@@ -45,6 +45,16 @@ def test_an_option_for_every_setting_reaches_the_settings():
     assert str(command.run) == "here"
     quick = train.parse(["--policy.taps", "1"]).config
     assert quick == replace(RECIPES["quick"], policy=replace(RECIPES["quick"].policy, taps=1))
+
+
+def test_a_policy_is_refined_as_it_is_executed():
+    config = train.parse(["--recipe", "refine"]).config
+    assert (config.objective, config.init) == ("delay", "general")
+    assert config.policy == checkpoint.config_of("general")
+    assert config.rollout_execution == checkpoint.executed_as("general")
+    config = train.parse(["--recipe", "refine", "--init", "n12-informed"]).config
+    assert config.policy == checkpoint.config_of("n12-informed")
+    assert config.rollout_execution == checkpoint.executed_as("n12-informed")
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,7 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(run, tmp_path):
         {"aggregation": "failed", "expert": "experts:lacam"},
         {"policy": replace(CONFIG.policy, graph_layer="own_layers:Forgetful")},
         {"families": MIXED.families, "augment": True, "beta_decay": 0.5},
+        {"families": CROWDS.families, "objective": "delay", "averaging": 0.9, "clip_norm": 1.0},
         {
             "families": CROWDS.families,
             "rollout_actions": "stuck",
