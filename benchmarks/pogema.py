@@ -42,7 +42,7 @@ LIFELONG_STEPS = 256
 """The length of an episode in POGEMA's lifelong benchmark."""
 LIFELONG_RESULTS = Path(__file__).with_name("pogema_lifelong.csv")
 """Means of published lifelong results, some team sizes of each set."""
-BATCH = 128
+BATCH = 32
 """Teams that are played at a time, between two steps of the progress bar."""
 
 
@@ -178,10 +178,10 @@ def _serve(cell: Cell, batch: Sequence[Case], seed: int) -> dict[str, list[Any]]
     """The arrivals and joint steps of some cases in lifelong play."""
     if cell.method.serve is None:
         raise ValueError(f"{cell.method.name} cannot play lifelong tasks")
-    arrivals = []
-    for case in batch:
-        goals = cell.group.maps[case.map_name].goal_sequences(cell.num_agents, case.seed, LIFELONG_STEPS)
-        arrivals.append(cell.method.serve(case.instance, goals, LIFELONG_STEPS, seed))
+    goals = [
+        cell.group.maps[each.map_name].goal_sequences(cell.num_agents, each.seed, LIFELONG_STEPS) for each in batch
+    ]
+    arrivals = cell.method.serve([case.instance for case in batch], goals, LIFELONG_STEPS, seed)
     return {"arrivals": arrivals, "steps": [LIFELONG_STEPS] * len(batch)}
 
 

@@ -51,9 +51,9 @@ class Method:
     """Everything that its results depend on besides the instances, T and the seed."""
     play: Callable[[Sequence[Instance], int, int], Played]
     """Play instances of any map sizes for at most T steps with a seed."""
-    serve: Callable[[Instance, npt.NDArray[np.int32], int, int], int] | None
-    """Serve goals forever: an instance, the goals (N, K, 2) that follow its own, steps and a seed in, the number of
-    arrivals out; None if the method cannot."""
+    serve: Callable[[Sequence[Instance], Sequence[npt.NDArray[np.int32]], int, int], list[int]] | None
+    """Serve goals forever: instances of one team size, the goals (N, K, 2) that follow each one's own, steps and a seed
+    in, the number of arrivals of each out; None if the method cannot."""
 
 
 def method_named(words: str) -> Method:
@@ -96,38 +96,43 @@ def _step_by_step(name: str, settings: Mapping[str, object], actor: Actor) -> Me
         steps = np.array([len(solution.paths) - 1 for solution in played.solutions], np.int64)
         return Played(played.success, played.on_goal, played.flowtime, played.makespan, steps)
 
-    def serve(instance: Instance, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
-        return arrivals(instance, actor, goals, steps, seed)
+    def serve(
+        instances: Sequence[Instance], goals: Sequence[npt.NDArray[np.int32]], steps: int, seed: int
+    ) -> list[int]:
+        return arrivals(instances, actor, goals, steps, seed)
 
     return Method(name, settings, play, serve)
 
 
-def arrivals(instance: Instance, actor: Actor, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
-    """Play one team for that many steps; return how often its robots come to their goals.
+def arrivals(
+    instances: Sequence[Instance], actor: Actor, goals: Sequence[npt.NDArray[np.int32]], steps: int, seed: int
+) -> list[int]:
+    """Play teams of one size for that many steps; return how often the robots of each come to their goals.
 
     A robot that arrives gets the next of its K `goals` (N, K, 2).
     """
-    height, width = instance.grid.shape
-    venv = BatchedEnv(
-        1,
-        num_agents=instance.num_agents,
-        height=height,
-        width=width,
+    env = BatchedEnv(
+        len(instances),
+        num_agents=instances[0].num_agents,
+        height=max(each.grid.shape[0] for each in instances),
+        width=max(each.grid.shape[1] for each in instances),
         style="empty",
+        fill=True,
         max_cycles=steps,
         task="lifelong",
         **actor.env_settings(),
     )
-    venv.reset([_seed(instance, seed)], instances=[instance], observe=False)
-    given = np.zeros(instance.num_agents, np.int64)
-    while venv.running.any():
-        current = venv.goals
-        arrived = np.flatnonzero(venv.step(actor.act(venv), observe=False).arrived[0])
-        if len(arrived):
-            current[0, arrived] = goals[arrived, given[arrived]]
+    env.reset([_seed(each, seed) for each in instances], instances=instances, observe=False)
+    to_come, given = np.stack(goals), np.zeros((len(instances), env.num_agents), np.int64)
+    while env.running.any():
+        current = env.goals
+        arrived = env.step(actor.act(env), observe=False).arrived
+        team, robot = np.nonzero(arrived)
+        if len(team):
+            current[arrived] = to_come[team, robot, given[arrived]]
             given[arrived] += 1
-            venv.assign_goals(current)
-    return int(given.sum())
+            env.assign_goals(current)
+    return given.sum(axis=1).tolist()
 
 
 def _seed(instance: Instance, seed: int) -> int:
@@ -183,8 +188,13 @@ def _rolling(words: str, options: str) -> Method:
         ]
         return outcomes_of(instances, trips, max_steps)
 
-    def serve(instance: Instance, goals: npt.NDArray[np.int32], steps: int, seed: int) -> int:
-        return arrivals(instance, RollingActor(instance, rounds, seed), goals, steps, seed)
+    def serve(
+        instances: Sequence[Instance], goals: Sequence[npt.NDArray[np.int32]], steps: int, seed: int
+    ) -> list[int]:
+        return [
+            arrivals([instance], RollingActor(instance, rounds, seed), [own], steps, seed)[0]
+            for instance, own in zip(instances, goals, strict=True)
+        ]
 
     return Method(words, {"rounds": rounds, "window": arguments.DEFAULT_WINDOW}, play, serve)
 

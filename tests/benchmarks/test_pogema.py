@@ -303,7 +303,19 @@ def test_a_robot_alone_goes_from_goal_to_goal_without_a_detour() -> None:
             assert method.serve is not None
             stops = np.concatenate([instance.starts, instance.goals, goals[0]])
             times = np.abs(np.diff(stops, axis=0)).sum(axis=1).cumsum()
-            assert method.serve(instance, goals, 60, 0) == (times <= 60).sum()
+            assert method.serve([instance], [goals], 60, 0) == [(times <= 60).sum()]
+
+
+@pytest.mark.parametrize("name", ["pibt", "pibt_swap", "rolling,20", "n12-informed"])
+def test_teams_that_are_served_together_arrive_as_often_as_alone(name: str) -> None:
+    halls = [parse_pogema_map("\n".join(["." * width] * 5)) for width in (4, 7, 5)]
+    instances = [hall.instance(3, seed) for seed, hall in enumerate(halls)]
+    goals = [hall.goal_sequences(3, seed, 40) for seed, hall in enumerate(halls)]
+    method = pogema_methods.method_named(name)
+    assert method.serve is not None
+    together = method.serve(instances, goals, 40, 0)
+    assert together == [method.serve([each], [own], 40, 0)[0] for each, own in zip(instances, goals, strict=True)]
+    assert min(together) > 10
 
 
 def test_rollouts_do_not_depend_on_the_other_cases(folder: Path) -> None:
