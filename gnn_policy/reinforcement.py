@@ -46,7 +46,8 @@ _NEAR = 2
 """Manhattan distance of the robots that share a loss."""
 _LEAST_SPREAD = 0.3
 """A team's advantages are divided by their deviation, or this share of that of all if it is more."""
-_ROBOTS_AT_ONCE = 8192
+_ROBOTS_AT_ONCE = 2048
+"""Robots that the network computes for at a time, which bounds the memory."""
 
 
 class Critic(nn.Module):
@@ -111,15 +112,14 @@ def loss_of(
 ) -> Outcome:
     """Return the clipped loss of the robots in `rows` of the experience, whose bag is given, plus the critic's."""
     logits, value = evaluate(policy, critic, bag)
-    order, explored = experience.order[rows], experience.explored[rows].float()
-    advantage = experience.advantage[rows]
-    ratio = (log_probability(logits, order, experience.places[rows]) - experience.log_prob[rows]).exp()
+    device, known = logits.device, experience
+    order, places, explored = (each[rows].to(device) for each in (known.order, known.places, known.explored))
+    before, advantage, target = (each[rows].to(device) for each in (known.log_prob, known.advantage, known.value))
+    ratio = (log_probability(logits, order, places) - before).exp()
     gain = torch.minimum(ratio * advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * advantage)
-    robots = explored.sum().clamp(min=1.0)
-    target = experience.value[rows]
-    surprise = (value - target).square().mean() / experience.value.var().clamp(min=1.0)
+    surprise = (value - target).square().mean() / known.value.var().clamp(min=1.0).item()
     kept = (logits.argmax(1) == order[:, 0]).float().mean()
-    return Outcome(0.5 * surprise - (gain * explored).sum() / robots, kept)
+    return Outcome(0.5 * surprise - (gain * explored).sum() / explored.sum().clamp(min=1), kept)
 
 
 class Explorer:
@@ -223,11 +223,14 @@ class Explorer:
         share = self._config.neighbour_share * reward[sender[near]]
         return reward.index_add(0, receiver[near], share)
 
-    def batches(self, experience: Experience, rng: np.random.Generator) -> Iterator[tuple[Bag, Int[Tensor, " M"]]]:
-        """Yield the bags and rows of random batches that have each state once."""
+    def batches(
+        self, experience: Experience, rng: np.random.Generator
+    ) -> Iterator[list[tuple[Bag, Int[Tensor, " M"]]]]:
+        """Yield random batches that have each state once, in parts: bags, and the rows of their robots."""
         states = experience.states
         for chosen in np.array_split(rng.permutation(len(states)), -(-len(states) // self._config.batch_size)):
-            yield self.perceive(states.take(chosen)), torch.from_numpy(states.rows(chosen))
+            rows = torch.from_numpy(states.rows(chosen))
+            yield [(self.perceive(part), rows[own]) for part, own in _in_parts(states.take(chosen))]
 
     def close(self) -> None:
         """Shut the collectors down."""

@@ -237,16 +237,19 @@ class Training:
         robots = 0
         updates = EPOCHS * sum(-(-len(each.states) // config.batch_size) for each in collected)
         for experience in [each for each in collected for _ in range(EPOCHS)]:
-            for bag, rows in explorer.batches(experience, rng):
-                with autocast(config.precision, self.policy.head.weight.device):
-                    outcome = loss_of(self.policy, self.critic, bag, experience, rows)
+            for parts in explorer.batches(experience, rng):
+                size, figures = sum(len(rows) for _, rows in parts), torch.zeros(2)
                 self.optimizer.zero_grad()
-                outcome.loss.backward()
+                for bag, rows in parts:
+                    with autocast(config.precision, self.policy.head.weight.device):
+                        outcome = loss_of(self.policy, self.critic, bag, experience, rows)
+                    (outcome.loss * len(rows) / size).backward()
+                    figures += torch.stack(outcome).detach().cpu() * len(rows) / size
                 if not learns:
                     self.policy.zero_grad()
                 self._step()
-                learned.append([outcome.loss.item(), outcome.kept.item()])
-                robots += len(rows)
+                learned.append(figures.tolist())
+                robots += size
                 if self.progress.due() or len(learned) == updates:
                     self.progress.fitted(number, len(learned), updates, np.array(learned)[:, 0], robots)
         try:
