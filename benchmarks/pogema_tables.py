@@ -23,9 +23,9 @@ LABELS = {
     "ISR": "robots on their goals at the end (ISR)",
     "SoC": "sum of costs (SoC)",
     "makespan": "makespan",
-    "throughput": "throughput, goals a step",
+    "throughput": "throughput, goals per step",
 }
-SPEED = "ms a step"
+SPEED = "ms per step"
 DRAWN = ("CSR", "SoC", "throughput")
 """The measures that have a figure."""
 

@@ -166,7 +166,7 @@ def main(options: Options) -> None:
     print(f"{options.robots:,} robots, {options.steps} steps, a map of {options.side} x {options.side}")
     print(f"page: {size / 1e6:.2f} MB, written in {wall:.2f} s ({used:.2f} CPU seconds)")
     frames, cpu = told["frames"], told["cpu/stop"] - told["cpu/start"]
-    print(f"playing: {frames / told['seconds']:.1f} frames a second over {told['steps']:.0f} steps")
+    print(f"playing: {frames / told['seconds']:.1f} frames per second over {told['steps']:.0f} steps")
     print(f"CPU: {cpu / frames * 1000:.1f} ms a frame in all processes of the browser")
     print(f"a picture: {told['whole']:.1f} ms by the clock until painted, of which the script {told['script']:.1f} ms")
     print(f"from one end of the episode to the other: {told['sought']:.1f} ms")

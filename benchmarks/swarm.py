@@ -47,7 +47,7 @@ def outcome(played: Rehearsal, instance: Instance, without: int | None = None) -
 def rehearsed(
     policy: ExportedPolicy, count: int, play: Callable[[Instance, int], Rehearsal], without: int | None = None
 ):
-    """Success, flowtime a robot, and the rehearsals of all cases."""
+    """Success, flowtime per robot, and the rehearsals of all cases."""
     played = [(play(case, number), case) for number, case in enumerate(cases(count))]
     results = [outcome(each, case, without) for each, case in played]
     robots = ROBOTS - (without is not None)
@@ -70,7 +70,7 @@ def radio(policy: ExportedPolicy, count: int) -> None:
             None,
         ),
     }
-    print("| radio | success | flowtime a robot |\n|---|---|---|")
+    print("| radio | success | flowtime per robot |\n|---|---|---|")
     seen_by_all = rehearsed(
         policy,
         count,
@@ -92,7 +92,7 @@ def radio(policy: ExportedPolicy, count: int) -> None:
 def bits(policy: ExportedPolicy, count: int) -> None:
     """The table of the numbers of messages."""
     print(
-        "| numbers | bytes of a message | success | flowtime a robot | bytes a robot sends a step |\n"
+        "| numbers | bytes of a message | success | flowtime per robot | bytes per robot and step |\n"
         "|---|---|---|---|---|"
     )
     precisions: tuple[Precision, ...] = ("float32", "float16", "int8")
@@ -110,7 +110,7 @@ def bits(policy: ExportedPolicy, count: int) -> None:
 
 def processes(policy: ExportedPolicy, steps: int, sizes: tuple[int, ...] = (4, 12, 30)) -> None:
     """The table of the time of a step where each robot is a process."""
-    print("| processes of robots | median ms a step | 90th percentile |\n|---|---|---|")
+    print("| processes of robots | median ms per step | 90th percentile |\n|---|---|---|")
     for size in sizes:
         instance, key, endpoint = cases(1, size)[0], secrets.token_bytes(32), free_endpoint()
         world = World(instance, policy.config, policy.execution, max_steps=steps)

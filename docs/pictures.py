@@ -1,17 +1,21 @@
 """Draw the pictures of README and docs again: `python docs/pictures.py` all of them, or those that are named.
 
-`field` draws the tables of docs/results/pogema.md, `animations` plays the packaged policies.
+`field` draws the tables of docs/results/pogema.md, `learning_curve` the metrics of a training by the recipe `quick`, which
+it left in its run folder, and `animations` plays the packaged policies.
 """
 
 from __future__ import annotations
 
+import csv
 import sys
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
 import gnn_policy
 import mapf_env
+from gnn_policy.learning_curve import Round, draw_learning_curve
 
 DOCS = Path(__file__).parent
 DEPOT = """
@@ -52,6 +56,16 @@ def field() -> None:
     figure.savefig(DOCS / "field.png", dpi=130)
 
 
+def learning_curve() -> None:
+    """Draw the learning curve of `mapf-env train` from the metrics.csv of its run folder, as the training itself does."""
+    rounds = []
+    with (DOCS / "tutorials" / "learning_curve.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            numbers: dict[str, Any] = {name: float(text) if text else None for name, text in row.items()}
+            rounds.append(Round(**numbers))
+    draw_learning_curve(rounds, DOCS / "tutorials" / "learning_curve.png")
+
+
 def animations() -> None:
     """Play teams under the packaged policies and draw them."""
     local, general = gnn_policy.load("n12"), gnn_policy.load()
@@ -73,5 +87,5 @@ def animations() -> None:
 
 
 if __name__ == "__main__":
-    for draw in [globals()[name] for name in sys.argv[1:]] or [field, animations]:
+    for draw in [globals()[name] for name in sys.argv[1:]] or [field, learning_curve, animations]:
         draw()

@@ -135,7 +135,7 @@ def _run(options: argparse.Namespace, instance: Instance, folder: Path, max_step
     finally:
         session.close()
     home = int((world.paths[-1] == instance.goals).all(axis=1).sum())
-    rate = f"{1000 * np.median(server.seconds):.0f} ms a step" if server.seconds else "no step to go"
+    rate = f"{1000 * np.median(server.seconds):.0f} ms per step" if server.seconds else "no step to go"
     title = f"{instance.num_agents} robots in processes of their own: {home} on goal after {world.step_number} steps"
     replay(instance, world.solution, out, title=title, config=EnvConfig(**policy.execution.env_settings(policy.config)))
     print(f"{title}, {rate}\nreplay: {out}")

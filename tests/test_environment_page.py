@@ -8,7 +8,7 @@ from pathlib import Path
 from mapf_env import BatchedEnv, EnvConfig, GridEnv
 
 PAGE = (Path(__file__).parents[1] / "docs" / "environment.md").read_text(encoding="utf-8")
-SHARED, OF_ONE_INTERFACE = PAGE.split("## Settings")[1].split("\n## ")[0].split("### Of one interface alone")
+SHARED, OF_ONE_INTERFACE = PAGE.split("## Settings")[1].split("\n## ")[0].split("### For single interfaces")
 
 
 def listed(part: str) -> dict[str, str]:
