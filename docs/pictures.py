@@ -1,7 +1,7 @@
 """Draw the pictures of README and docs again: `python docs/pictures.py` all of them, or those that are named.
 
-`field` draws the tables of docs/results/pogema.md, `learning_curve` the metrics of a training by the recipe `quick`, which
-it left in its run folder, and `animations` plays the packaged policies.
+`field` draws the tables of docs/results/pogema.md, `learning_curve` the metrics that a training by the recipe `quick`
+left in its run folder, and `animations` plays the packaged policies.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def field() -> None:
 
 
 def learning_curve() -> None:
-    """Draw the learning curve of `mapf-env train` from the metrics.csv of its run folder, as the training itself does."""
+    """Draw the learning curve of `mapf-env train` from the metrics of its run folder, as the training itself does."""
     rounds = []
     with (DOCS / "tutorials" / "learning_curve.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
