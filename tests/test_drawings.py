@@ -1,11 +1,15 @@
 """The drawings of the docs are those of their script, and show what they say."""
 
+import csv
 import importlib.util
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from gnn_policy.failures import failure
+from gnn_policy.learning_curve import Round
+from gnn_policy.recipes import RECIPES
 
 HOME = Path(__file__).parents[1] / "docs" / "drawings"
 spec = importlib.util.spec_from_file_location("draw", HOME / "draw.py")
@@ -35,3 +39,14 @@ def test_every_drawing_is_shown() -> None:
     drawings = {path.name for path in HOME.glob("*.svg")}
     assert drawings
     assert drawings == {name for name in drawings if f"](drawings/{name})" in pages}
+
+
+def test_the_learning_curve_of_the_docs_belongs_to_the_recipe_of_its_caption() -> None:
+    text = (HOME.parent / "tutorials" / "learning_curve.csv").read_text(encoding="utf-8")
+    rows = list(csv.DictReader(text.splitlines()))
+    quick = RECIPES["quick"]
+    assert set(rows[0]) == {field.name for field in fields(Round)}
+    assert [int(row["updates"]) for row in rows] == [
+        (r + 1) * (quick.updates_per_round or 0) for r in range(quick.rounds)
+    ]
+    assert (HOME.parent / "tutorials" / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
