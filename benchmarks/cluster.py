@@ -1,4 +1,4 @@
-"""What a Ray cluster costs and gains: seconds of a case, of its way through the calling process, and the speed-up.
+"""Costs and gains of a Ray cluster: seconds of a case, of its way through the calling process, and the speed-up.
 
     python benchmarks/cluster.py
 
