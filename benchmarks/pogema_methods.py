@@ -52,7 +52,7 @@ class Method:
     play: Callable[[Sequence[Instance], int, int], Played]
     """Play instances of any map sizes for at most T steps with a seed."""
     serve: Callable[[Sequence[Instance], Sequence[npt.NDArray[np.int32]], int, int], list[int]] | None
-    """Serve goals forever: instances of one team size, the goals (N, K, 2) that follow each instance's own, steps and a seed
+    """Serve goals forever: instances of one team size, the goals (N, K, 2) that follow the instance's, steps and a seed
     in, the number of arrivals of each out; None if the method cannot."""
 
 
