@@ -2,10 +2,14 @@
 
 The audit reads the positions before and after a step and shares no code with the environment. The exit status is 1 if
 it finds a collision or any other fault.
+
+    python benchmarks/audit.py
+    python benchmarks/audit.py --robots 100000 --steps 1000000
 """
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -39,6 +43,15 @@ class Options:
     """The seed of instances and actions."""
     robots_at_once: int = 4096
     """Robots that are stepped in one call."""
+    robots: tuple[int, ...] = ()
+    """Team sizes to audit instead of the scenes, on square maps of ten cells for each robot, a tenth are obstacles."""
+
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """The scenes to play."""
+        sides = (math.ceil(math.sqrt(10 * robots)) for robots in self.robots)
+        large = tuple(Scene(side, side, 0.1, robots) for side, robots in zip(sides, self.robots, strict=True))
+        return large or SCENES
 
 
 @dataclass(frozen=True)
@@ -159,16 +172,18 @@ def audit(scene: Scene, steps: int, robots_at_once: int, seed: int) -> Iterator[
         dtype="uint8",
     )
     generator = np.random.default_rng(seed)
-    env.reset(seed)
+    # Dense observations of a large team would take most of the time, or do not fit.
+    observe = scene.num_agents <= robots_at_once
+    env.reset(seed, observe=observe)
     grids, played = env.grids, 0
     while played < steps:
         began = time.perf_counter()
         before, wanted = env.positions, generator.integers(0, IDLE + 1, (num_envs, scene.num_agents))
-        step = env.step(wanted)
+        step = env.step(wanted, observe=observe)
         tally = audit_step(grids, before, wanted, env.positions, step.replaced)
         ended = step.terminated | step.truncated
         if ended.any():
-            env.reset(mask=ended)
+            env.reset(mask=ended, observe=observe)
             grids = env.grids
         tally.seconds = time.perf_counter() - began
         played += tally.agent_steps
@@ -199,12 +214,13 @@ def figures(tally: Tally) -> tuple[str, ...]:
 
 def main(options: Options) -> int:
     """Audit all scenes; returns the exit code."""
-    tallies = {scene: Tally() for scene in SCENES}
-    share = -(-options.steps // len(SCENES))
+    scenes = options.scenes
+    tallies = {scene: Tally() for scene in scenes}
+    share = -(-options.steps // len(scenes))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bar = progress.add_task("agent-steps", total=options.steps)
-        for number, scene in enumerate(SCENES):
+        for number, scene in enumerate(scenes):
             for tally in audit(scene, share, options.robots_at_once, options.seed + number):
                 tallies[scene].add(tally)
                 progress.advance(bar, tally.agent_steps)

@@ -1,10 +1,11 @@
-"""Time and memory of a step from a hundred robots to a million, on one thread.
+"""Time and memory of a step from a hundred robots to a million, and the bars that they are held against.
 
-    python benchmarks/scale.py            measure what is missing in docs/scale.csv and draw docs/scale.png
-    python benchmarks/scale.py --kinds policy --robots 1000000 --steps 100
+    python benchmarks/scale.py              measure what is missing in docs/scale.csv and draw docs/scale.png
+    python benchmarks/scale.py --million    and a million robots under the policy, 100 steps: most of an hour
 
 Each measurement runs in a process of its own, whose greatest memory is recorded, and is written as soon as it is there:
-a run that was stopped goes on where it was. Times are CPU seconds, so that other programs disturb them little.
+a run that was stopped goes on where it was. CPU seconds are disturbed little by other programs, seconds by the clock
+need a machine at rest.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import multiprocessing
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -24,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import track
 from rich.table import Table
 
 from mapf_env import BatchedEnv, Instance, random_instance
@@ -44,6 +45,12 @@ class Options:
 
     robots: tuple[int, ...] = (100, 1_000, 10_000, 100_000, 1_000_000)
     """Team sizes."""
+    million: bool = False
+    """Measure a million robots under the policy, too: `million_steps` steps."""
+    million_steps: int = 100
+    """Steps of that measurement."""
+    threads: int = 2
+    """CPU threads of the network; steps of the environment take one."""
     kinds: tuple[Kind, ...] = KINDS
     """Steps to measure: the environment's with what robots perceive, under the paper's shield; the PIBT shield's alone;
     and those of a policy, which perceives, computes, and steps."""
@@ -51,6 +58,8 @@ class Options:
     """Steps of each measurement; small teams take as many as 10,000 robots do in that many."""
     most_with_map: int = 10_000
     """The largest team that knows the map: it searches for the way of each robot."""
+    most_with_policy: int = 100_000
+    """The largest team under the policy, except for the million."""
     seed: int = 0
     """Seed of maps, teams and actions."""
     table: Path = DOCS / "scale.csv"
@@ -72,6 +81,8 @@ class Row:
     """CPU seconds from the instance to the first step."""
     step_microseconds: float
     """CPU time of a step a robot, the median over the steps."""
+    step_seconds: float
+    """Seconds of a step by the clock, the median over the steps."""
     bytes_per_robot: float
     """The process's greatest memory beyond what it had before the instance was drawn, a robot."""
     peak_mib: float
@@ -106,7 +117,7 @@ def environment(instance: Instance, **settings: Any) -> BatchedEnv:
     return env
 
 
-def prepared(kind: Kind, instance: Instance, seed: int) -> Callable[[], object]:
+def prepared(kind: Kind, instance: Instance, seed: int, threads: int) -> Callable[[], object]:
     """Reset, and return what makes a step."""
     generator = np.random.default_rng(seed)
     if kind in ("environment", "pibt"):
@@ -124,7 +135,7 @@ def prepared(kind: Kind, instance: Instance, seed: int) -> Callable[[], object]:
     import gnn_policy
     from gnn_policy.rollout import PolicyActor
 
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     policy = gnn_policy.load(POLICIES[kind]).eval()
     actor = PolicyActor(policy, policy.execution)
     acting = environment(instance, **actor.env_settings())
@@ -142,20 +153,22 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "linux" else 2**20)
 
 
-def measure(kind: Kind, robots: int, steps: int, seed: int) -> Row:
-    """One measurement, in the process that calls this."""
+def measure(kind: Kind, robots: int, steps: int, seed: int, threads: int) -> Row:
+    """One measurement, in the process that calls this, with a progress bar over its steps."""
     if kind in POLICIES:
-        prepared(kind, instance_of(kind, 100, seed), seed)()  # libraries are loaded before memory is counted
+        prepared(kind, instance_of(kind, 100, seed), seed, threads)()  # libraries are loaded before memory is counted
     before = resident()
     instance = instance_of(kind, robots, seed)
     began = time.process_time()
-    step = prepared(kind, instance, seed)
+    step = prepared(kind, instance, seed, threads)
     ready = time.process_time() - began
-    seconds, first = list[float](), 0.0
-    for number in range(max(steps, steps * 10_000 // robots // 4)):
-        began = time.process_time()
+    seconds, by_clock, first = list[float](), list[float](), 0.0
+    count = max(steps, steps * 10_000 // robots // 4)
+    for number in track(range(count), f"{kind}, {robots:,} robots", transient=True):
+        began, began_by_clock = time.process_time(), time.perf_counter()
         step()
         seconds.append(time.process_time() - began)
+        by_clock.append(time.perf_counter() - began_by_clock)
         first = resident() if number == 1 else first
     height, width = instance.grid.shape
     return Row(
@@ -166,6 +179,7 @@ def measure(kind: Kind, robots: int, steps: int, seed: int) -> Row:
         steps=len(seconds),
         reset_seconds=round(ready, 3),
         step_microseconds=round(float(np.median(seconds)) / robots * 1e6, 3),
+        step_seconds=round(float(np.median(by_clock)), 6),
         bytes_per_robot=round(max(peak() - before, 0.0) * 2**20 / robots, 1),
         peak_mib=round(peak(), 1),
         first_mib=round(first, 1),
@@ -223,29 +237,72 @@ def draw(rows: list[Row], path: Path) -> None:
     plt.close(figure)
 
 
+def bars(rows: list[Row]) -> Table:
+    """What was asked for, next to what was measured."""
+    found = {(row.kind, row.robots): row for row in rows}
+    table = Table("bar", "measured", "met", title="Bars")
+
+    def add(bar: str, needed: Sequence[tuple[Kind, int]], judge: Callable[..., tuple[str, bool]]) -> None:
+        missing = [f"{kind}, {robots:,} robots" for kind, robots in needed if (kind, robots) not in found]
+        shown, met = (
+            ("not measured: " + "; ".join(missing), False) if missing else judge(*(found[key] for key in needed))
+        )
+        table.add_row(bar, shown, "" if missing else "yes" if met else "no")
+
+    def ratio(few: Row, many: Row) -> tuple[str, bool]:
+        times = many.step_microseconds / few.step_microseconds
+        return f"{times:.2f} times ({many.step_microseconds:.2f} and {few.step_microseconds:.2f} µs)", times <= 1.5
+
+    def below(seconds: float) -> Callable[[Row], tuple[str, bool]]:
+        return lambda row: (f"{1000 * row.step_seconds:.1f} ms", row.step_seconds < seconds)
+
+    def million(row: Row) -> tuple[str, bool]:
+        shown = f"{row.peak_mib / 1024:.1f} GiB at most, {row.steps} steps of {row.step_seconds:.1f} s"
+        growth = f"; memory after the second step {row.first_mib:,.0f} MiB, after the last {row.last_mib:,.0f} MiB"
+        return shown + growth, row.steps >= 100 and row.peak_mib * 2**20 < 12e9
+
+    add(
+        "environment: CPU time a robot and step of 100,000 at most 1.5 times that of 1,000",
+        [("environment", 1_000), ("environment", 100_000)],
+        ratio,
+    )
+    add("policy: 1,000 robots in less than 20 ms a step", [("policy", 1_000)], below(0.02))
+    add("policy with the map: 1,000 robots in less than 20 ms a step", [("policy with the map", 1_000)], below(0.02))
+    add("policy with the map: 10,000 robots on 512 x 512 in less than 1 s", [("policy with the map", 10_000)], below(1))
+    add("policy: a million robots on 4096 x 4096, 100 steps in less than 12 GB", [("policy", 1_000_000)], million)
+    return table
+
+
 def main(options: Options) -> None:
     """Measure what is missing, and show and draw all there is."""
     rows = read(options.table)
     known = {(row.kind, row.robots) for row in rows}
-    wanted: list[tuple[Kind, int]] = [
-        (kind, robots)
+    most = {"policy": options.most_with_policy, "policy with the map": options.most_with_map}
+    wanted: list[tuple[Kind, int, int]] = [
+        (kind, robots, options.steps)
         for robots in options.robots
         for kind in options.kinds
-        if (kind, robots) not in known and (kind != "policy with the map" or robots <= options.most_with_map)
+        if robots <= most.get(kind, robots)
     ]
+    if options.million:
+        wanted.append(("policy", 1_000_000, options.million_steps))
+    wanted = [each for each in wanted if each[:2] not in known]
     spawn = multiprocessing.get_context("spawn")
-    with Progress() as progress:
-        for kind, robots in progress.track(wanted, description="measurements"):
-            with ProcessPoolExecutor(1, spawn) as worker:
-                rows.append(worker.submit(measure, kind, robots, options.steps, options.seed).result())
-            write(options.table, rows)
+    for number, (kind, robots, steps) in enumerate(wanted, start=1):
+        Console().print(f"measurement {number} of {len(wanted)}: {kind}, {robots:,} robots")
+        with ProcessPoolExecutor(1, spawn) as worker:
+            rows.append(worker.submit(measure, kind, robots, steps, options.seed, options.threads).result())
+        write(options.table, rows)
     draw(rows, options.figure)
-    table = Table("kind", "robots", "map", "steps", "reset s", "µs a robot and step", "bytes a robot", "peak MiB")
+    table = Table("kind", "robots", "map", "steps", "reset s", "CPU µs a robot", "s a step", "bytes a robot", "MiB")
     for row in read(options.table):
         shape = f"{row.height} x {row.width}"
-        figures = (f"{row.reset_seconds:.2f}", f"{row.step_microseconds:.2f}", f"{row.bytes_per_robot:,.0f}")
-        table.add_row(row.kind, f"{row.robots:,}", shape, str(row.steps), *figures, f"{row.peak_mib:,.0f}")
-    Console().print(table)
+        times = (f"{row.reset_seconds:.2f}", f"{row.step_microseconds:.2f}", f"{row.step_seconds:.4f}")
+        memory = (f"{row.bytes_per_robot:,.0f}", f"{row.peak_mib:,.0f}")
+        table.add_row(row.kind, f"{row.robots:,}", shape, str(row.steps), *times, *memory)
+    wide = Console(width=max(Console().width, 110))
+    wide.print(table)
+    wide.print(bars(rows))
 
 
 if __name__ == "__main__":

@@ -45,6 +45,12 @@ def test_the_audit_counts_faults(
     assert audited(before, wanted, after, replaced) == expected
 
 
+def test_the_audit_plays_teams_of_any_size(capsys: pytest.CaptureFixture[str]) -> None:
+    """With 100,000 robots the dense graph of an observation would take 40 GB."""
+    assert main(Options(steps=100_000, robots=(100_000,))) == 0
+    assert "1000x1000" in capsys.readouterr().out
+
+
 def test_the_audit_passes(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(Options(steps=20_000, robots_at_once=64)) == 0
     assert "replaced" in capsys.readouterr().out

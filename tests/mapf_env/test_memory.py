@@ -95,6 +95,22 @@ def test_pettingzoo_with_resets(options: dict[str, Any]) -> None:
     assert_flat(play)
 
 
+def test_a_large_team_that_is_read_tile_by_tile() -> None:
+    env, generator = BatchedEnv(1, num_agents=5000, height=230, width=230, max_cycles=10**6), np.random.default_rng(0)
+    env.reset(0, observe=False)
+    actions = generator.integers(0, 5, (4, 1, 5000))
+
+    def play(steps: int) -> None:
+        for step in range(steps):
+            env.bag()
+            env.step(actions[step % 4], observe=False)
+
+    play(10)
+    _, used = handed_out()
+    play(40)
+    assert handed_out()[1] - used < 5000
+
+
 def test_the_joint_view() -> None:
     env = joint_env(**SETTINGS)
     env.reset(seed=0)

@@ -11,7 +11,18 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import strategies
-from mapf_env import BatchedEnv, Instance, Maze, random_instance, rules, team_state
+from mapf_env import (
+    BatchedEnv,
+    Instance,
+    MapSet,
+    Maze,
+    Senses,
+    States,
+    perceive,
+    random_instance,
+    rules,
+    team_state,
+)
 
 
 @given(strategies.all_settings(), strategies.seeds, st.integers(0, 2000))
@@ -145,6 +156,76 @@ def test_robots_behind_walls_do_not_change_a_step(shield: str) -> None:
         large.step(actions, observe=False)
         small.step(actions[:, :200], observe=False)
         assert np.array_equal(large.positions[:, :200], small.positions)
+
+
+@given(strategies.seeds, st.integers(4, 40), st.integers(4, 40), st.floats(0, 1), st.floats(0, 9), st.floats(0, 0.6))
+@hypothesis_settings(max_examples=60)
+def test_edges_are_those_of_the_dense_graph_on_random_worlds(
+    seed: int, height: int, width: int, crowded: float, radius: float, loss: float
+) -> None:
+    robots = max(round(crowded * 0.7 * height * width), 2)
+    instance = random_instance(height=height, width=width, density=0.1, num_agents=robots, seed=seed)
+    states = States.start_of([instance], Senses(comm_radius=radius), [0], seeds=[seed])
+    bag = perceive(states, MapSet([instance.grid], 4), Senses(comm_weights="distance"), message_loss=loss)
+    dense = rules.communication_graph(instance.starts[None], radius, weights="distance")
+    dense = rules.lose_messages(dense, loss, states.seeds, np.zeros(1, np.int64))[0]
+    receiver, sender = np.nonzero(dense)
+    assert np.array_equal(bag.edge_index, [sender, receiver])
+    assert np.array_equal(bag.edge_weight, dense[receiver, sender])
+
+
+@pytest.mark.parametrize("shield", ["idle", "pibt"])
+def test_regions_that_cannot_see_each_other_step_as_if_the_world_were_cut(shield: str) -> None:
+    """Four walled regions of 1,500 robots each are one team that is read tile by tile; a region alone is not."""
+    parts = [random_instance(height=150, width=130, density=0.1, num_agents=1500, seed=seed) for seed in range(4)]
+    wall, shift = np.ones((150, 9), np.bool_), 139
+    grid = np.concatenate([block for part in parts for block in (part.grid, wall)], axis=1)
+    east = [np.array([0, shift * number]) for number in range(4)]
+    starts = np.concatenate([part.starts + own for part, own in zip(parts, east, strict=True)])
+    goals = np.concatenate([part.goals + own for part, own in zip(parts, east, strict=True)])
+    together, width = Instance(grid, starts, goals), 4 * shift
+    settings: dict[str, Any] = {"num_agents": 6000, "height": 150, "density": 0.0, "style": "empty", "shield": shield}
+    env = BatchedEnv(1, width=width, **settings)
+    alone = [BatchedEnv(1, width=width, **settings) for _ in parts]  # all others idle, so that numbers are the same
+    for each in (env, *alone):
+        each.reset(7, instances=[together], observe=False)
+    generator = np.random.default_rng(0)
+    for _ in range(6):
+        actions = generator.integers(0, 5, (1, 6000))
+        env.step(actions, observe=False)
+        for number, each in enumerate(alone):
+            own = slice(1500 * number, 1500 * (number + 1))
+            wanted = np.full_like(actions, 4)
+            wanted[:, own] = actions[:, own]
+            each.step(wanted, observe=False)
+            assert np.array_equal(env.positions[0, own], each.positions[0, own])
+    bag, maps = env.bag(), MapSet([part.grid for part in parts], 4)
+    first = 0
+    for number, part in enumerate(parts):
+        own = slice(1500 * number, 1500 * (number + 1))
+        here = part.at(env.positions[0, own] - east[number])
+        state = States.start_of([here], Senses(), [number])
+        region = perceive(state, maps, Senses())
+        last = first + region.edge_index.shape[1]
+        assert np.array_equal(bag.fov[own], region.fov)
+        assert np.array_equal(bag.edge_index[:, first:last], region.edge_index + 1500 * number)
+        assert np.array_equal(bag.edge_weight[first:last], region.edge_weight)
+        first = last
+    assert first == bag.edge_index.shape[1]
+
+
+def test_threads_change_nothing_in_large_teams() -> None:
+    settings: dict[str, Any] = {"num_agents": 4500, "height": 150, "width": 150, "shield": "pibt"}
+    one, several = (BatchedEnv(2, threads=threads, **settings) for threads in (1, 2))
+    generator = np.random.default_rng(0)
+    for each in (one, several):
+        each.reset(0, observe=False)
+    for _ in range(4):
+        assert all(np.array_equal(ours, theirs) for ours, theirs in zip(one.bag(), several.bag(), strict=True))
+        actions = generator.integers(0, 5, (2, 4500))
+        for each in (one, several):
+            each.step(actions, observe=False)
+        assert np.array_equal(one.positions, several.positions)
 
 
 def test_a_push_may_be_as_long_as_the_team() -> None:
