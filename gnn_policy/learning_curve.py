@@ -28,7 +28,7 @@ class Round:
     fit_seconds: float
     """Time of this round's gradient steps."""
     loss: float
-    """Mean cross-entropy of this round; for the objective "delay" the share of steps that robots lost."""
+    """Mean cross-entropy of this round; for the objective "delay" the steps that a robot lost in a step."""
     accuracy: float
     """Share of the expert's moves, or of those that were drawn in rollouts, that the policy would make; it falls as
     aggregation adds hard states."""

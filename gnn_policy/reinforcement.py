@@ -1,10 +1,10 @@
 """Reinforcement learning from lost steps: what imitation has taught is improved by proximal policy optimisation.
 
-A robot loses a step whenever it is off its goal and does not come closer to it: the reward "shaped" of the environment.
-A loss counts for the robot and, in part, for the robots next to it, which may be its cause. Robots that would take
-their most probable move draw it instead; the shield, and robots that draw anyway (stuck ones), belong to the
-environment. Under a PIBT shield a robot's choice is an order of moves, of which it learns the places down to the
-move that was executed.
+A robot loses a step when it is off its goal and does not come closer to it (the reward "shaped" of the environment).
+It loses some more when it has to leave its goal. A loss counts for the robot and, in part, for the robots next to it,
+which may be its cause. Robots that would take their most probable move draw it instead; the shield, and robots that
+draw anyway (stuck ones), belong to the environment. Under a PIBT shield a robot's choice is an order of moves, of which
+it learns the places down to the move that was executed.
 
 Sources: Schulman et al. 2017 (proximal policy optimization) and 2016 (generalized advantage estimation); Plackett 1975
 and Luce 1959 (probabilities of orders).
@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
@@ -31,7 +30,7 @@ from gnn_policy.dagger import Player, split_teams
 from gnn_policy.labelling import Labeller
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
-from gnn_policy.team_env import ACTION, MOVES, POSITIONS, REWARD, states_of
+from gnn_policy.team_env import ACTION, GOALS, MOVES, POSITIONS, REWARD, states_of
 from mapf_env import Action, Bag, MapSet, States, perceive
 
 EXPLORATION = 0.5
@@ -42,6 +41,8 @@ CLIP = 0.2
 """A batch may change the probability of a choice by this share of it."""
 EPOCHS = 2
 """Times that the states of a round are used."""
+DISPLACEMENT = 10.0
+"""Steps that count as lost when a robot of a one-shot task leaves its goal: it has rested there in vain."""
 _NEAR = 2
 """Manhattan distance of the robots that share a loss."""
 _LEAST_SPREAD = 0.3
@@ -146,7 +147,7 @@ class Explorer:
         collected = []
         for player in self._players:
             player.begin(beta=0.0, seed=seed)
-            collected += [self._experience(player.visit(), player.cases.map_of) for _ in range(times)]
+            collected += [self._experience(player.visit(), player) for _ in range(times)]
         return collected
 
     def perceive(self, states: States) -> Bag:
@@ -154,7 +155,7 @@ class Explorer:
         on_maps = replace(states, maps=self._maps.index[states.maps])
         return tensors(perceive(on_maps, self._maps, self._senses), self._policy.head.weight.device)
 
-    def _experience(self, visited: TensorDictBase, map_of: npt.NDArray[np.int32]) -> Experience:
+    def _experience(self, visited: TensorDictBase, player: Player) -> Experience:
         """Return the experience of B teams over T steps.
 
         The collector keeps no state after a team's last step, so nothing is learned from the choice in that step, and a
@@ -163,10 +164,15 @@ class Explorer:
         done, terminated = (visited["next", key][..., 0].clone() for key in ("done", "terminated"))
         last = done.clone()
         last[:, -1] = True
-        states = states_of(visited.reshape(-1), map_of)
+        states = states_of(visited.reshape(-1), player.cases.map_of)
         there = torch.arange(visited[POSITIONS].shape[2]) < visited["team_size"][..., None]  # (B, T, N)
         order, places = self._choices(visited, there)
         reward = visited["next", REWARD][..., 0][there]
+        cost = -reward
+        if player.task == "one_shot":
+            on_goal = (visited[POSITIONS] == visited[GOALS]).all(-1)
+            left = on_goal & ~on_goal.roll(-1, 1) & ~last[..., None]
+            cost = cost + DISPLACEMENT * left[there]
         log_prob, value, explored, shared = [], [], [], []
         for part, rows in _in_parts(states):
             bag = self.perceive(part)
@@ -175,7 +181,7 @@ class Explorer:
             value.append(predicted)
             facts = facts_of(bag, self._execution, self._config.policy)
             explored.append(torch.from_numpy(~self._execution.draws(facts.alarmed)))
-            shared.append(self._shared(bag, part, reward[rows]))
+            shared.append(self._shared(bag, part, -cost[rows]))
         learned = torch.zeros_like(there)
         learned[there] = torch.cat(explored)
         learned[last] = False
