@@ -40,6 +40,7 @@ class Mixture(TensorDictModuleBase):
 
     beta: torch.Tensor
     seed: torch.Tensor
+    task: Task
 
     def __init__(
         self,

@@ -170,7 +170,7 @@ class Explorer:
         reward = visited["next", REWARD][..., 0][there]
         cost = -reward
         if player.task == "one_shot":
-            on_goal = (visited[POSITIONS] == visited[GOALS]).all(-1)
+            on_goal = torch.eq(visited.get(POSITIONS), visited.get(GOALS)).all(-1)
             left = on_goal & ~on_goal.roll(-1, 1) & ~last[..., None]
             cost = cost + DISPLACEMENT * left[there]
         log_prob, value, explored, shared = [], [], [], []

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import fields, replace
 from functools import partial
 from importlib.util import find_spec
@@ -63,8 +64,18 @@ def listening(processes: set[int]) -> list[str]:
 
 @pytest.fixture(scope="module")
 def workers() -> Iterator[cluster.Workers]:
-    with cluster.connect("local", workers=2) as found:
-        yield found
+    with ExitStack() as stack:
+        yield started(stack, 4)
+
+
+def started(stack: ExitStack, tries: int) -> cluster.Workers:
+    """Start Ray, again where a busy machine takes longer than the 30 seconds that Ray gives itself."""
+    try:
+        return stack.enter_context(cluster.connect("local", workers=2))
+    except Exception as failure:
+        if tries == 1 or "timed out during startup" not in str(failure):
+            raise
+        return started(stack, tries - 1)
 
 
 def same(one: experts.Result, other: experts.Result) -> bool:
