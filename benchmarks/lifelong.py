@@ -93,7 +93,7 @@ def measured(
     """Return the throughput, and the seconds of a joint step of one team."""
     if method.serve is None:
         raise ValueError(f"{method.name} plans to the end of an instance, and lifelong play has none: leave it out")
-    instances, goals = ([each[part] for each in problems] for part in (0, 1))
+    instances, goals = [each for each, _ in problems], [own for _, own in problems]
     began = time.perf_counter()
     arrivals = method.serve(instances, goals, steps, 0)
     seconds = time.perf_counter() - began
