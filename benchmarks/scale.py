@@ -238,7 +238,7 @@ def draw(rows: list[Row], path: Path) -> None:
 
 
 def bars(rows: list[Row]) -> Table:
-    """What was asked for, next to what was measured."""
+    """Return a table of what was asked for, next to what was measured."""
     found = {(row.kind, row.robots): row for row in rows}
     table = Table("bar", "measured", "met", title="Bars")
 
