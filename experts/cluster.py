@@ -34,7 +34,7 @@ class Workers:
     """The workers of the cluster that this process is connected to; made by `connect`."""
 
     def __init__(self) -> None:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
 
         self._ray: Any = ray
         self._call = _remote_call(MOST_RETRIES)
@@ -154,14 +154,14 @@ def _ray(address: str) -> Any:
     for name, value in wishes.items():
         os.environ.setdefault(name, value)
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ImportError(
             'a cluster needs the extra "cluster" (there is no ray): pip install "mapf-env[cluster]", or in a checkout '
             'pip install ".[cluster]"'
         ) from None
     if address == LOCAL and os.environ[_OF_MACHINES] == "0":
-        from ray._private import ray_constants
+        from ray._private import ray_constants  # pyright: ignore[reportMissingImports]
 
         ray_constants.ENABLE_RAY_CLUSTER = False  # for a Ray that was imported before the variable was set
     return ray
@@ -170,7 +170,7 @@ def _ray(address: str) -> Any:
 @cache
 def _remote_call(retries: int) -> Any:
     """Return `_call` as Ray's workers call it: one object for all connections, since each is sent to all workers."""
-    import ray
+    import ray  # pyright: ignore[reportMissingImports]
 
     return ray.remote(num_cpus=1, max_retries=retries, retry_exceptions=False)(_call)
 

@@ -30,7 +30,7 @@ from gnn_policy.training import Training
 from mapf_env import Instance, random_instance
 from small_training import CONFIG, CROWDS
 
-pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray has no wheel for this Python")
+pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra cluster")
 
 INSTANCES = [random_instance(num_agents=3 + seed % 4, seed=seed) for seed in range(24)]
 
