@@ -148,7 +148,8 @@ def _ray(address: str) -> Any:
         "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     }
     if address == LOCAL:
-        wishes |= {_OF_MACHINES: "0", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        # Under `uv run` Ray would install this package again for its workers, who have the caller's already.
+        wishes |= {_OF_MACHINES: "0", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
         if "ray" not in sys.modules:  # else it has decided already, and makes the same decision with a warning
             wishes["RAY_AUTH_MODE"] = "token"
     for name, value in wishes.items():
@@ -160,10 +161,13 @@ def _ray(address: str) -> Any:
             'a cluster needs the extra "cluster" (there is no ray): pip install "mapf-env[cluster]", or in a checkout '
             'pip install ".[cluster]"'
         ) from None
-    if address == LOCAL and os.environ[_OF_MACHINES] == "0":
+    if address == LOCAL:
         from ray._private import ray_constants  # pyright: ignore[reportMissingImports]
 
-        ray_constants.ENABLE_RAY_CLUSTER = False  # for a Ray that was imported before the variable was set
+        # For a Ray that was imported before the variables were set.
+        ray_constants.RAY_ENABLE_UV_RUN_RUNTIME_ENV = False
+        if os.environ[_OF_MACHINES] == "0":
+            ray_constants.ENABLE_RAY_CLUSTER = False
     return ray
 
 
