@@ -148,7 +148,7 @@ def _ray(address: str) -> Any:
         "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     }
     if address == LOCAL:
-        # Under `uv run` Ray would install this package again for its workers, who have the caller's already.
+        # Under `uv run` Ray would install this package again for its workers, which have the caller's already.
         wishes |= {_OF_MACHINES: "0", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
         if "ray" not in sys.modules:  # else it has decided already, and makes the same decision with a warning
             wishes["RAY_AUTH_MODE"] = "token"

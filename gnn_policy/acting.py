@@ -79,12 +79,12 @@ def facts_of(bag: Bag, execution: Execution, config: PolicyConfig) -> Facts:
     Raises:
         ValueError: If the bag does not say them.
     """
-    facts = execution.facts(np.asarray(bag.scalars), config)
+    facts = execution.facts(bag.scalars, config)
     alarm = np.zeros(len(bag.team), np.bool_)
     if "stuck" in facts:
         alarm = facts["stuck"][:, 0]
         if execution.actions == "stuck" and config.taps > 1:  # with one tap robots do not communicate
-            alarm = alarmed(alarm, np.asarray(bag.edge_index))
+            alarm = alarmed(alarm, bag.edge_index)
     return Facts(alarm, facts.get("greedy_moves"), facts["jammed"][:, 0] if "jammed" in facts else None)
 
 

@@ -29,7 +29,7 @@ from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
 from gnn_policy.processes import Process
 from gnn_policy.team_env import ACTION, CASE, POSITIONS, STATE_KEYS, TeamEnv, states_of
-from mapf_env import Action, MapSet, States, perceive
+from mapf_env import Action, Bag, MapSet, States, perceive
 
 
 class Mixture(TensorDictModuleBase):
@@ -96,14 +96,16 @@ class Mixture(TensorDictModuleBase):
         chosen[~present] = Action.IDLE
         return tensordict.set(ACTION, torch.from_numpy(chosen))
 
+    def perceive(self, states: States) -> Bag:
+        """Return what the robots perceive in the given states, for the policy and for its execution."""
+        return perceive(replace(states, maps=self._maps.index[states.maps]), self._maps, self._senses)
+
     def _score(self, states: States) -> npt.NDArray[np.float32]:
-        maps = self._maps.index[states.maps]
-        bag = perceive(replace(states, maps=maps), self._maps, self._senses)
         team = states.team
         robot = np.arange(states.num_robots) - states.offsets[team]
         noise = episode_noise(states.seeds[team], states.times[team], robot)
         with autocast(self.config.precision, self.policy.head.weight.device):
-            return scores_of(self.policy, bag, self.config.rollout_execution, noise, self.exploration)
+            return scores_of(self.policy, self.perceive(states), self.config.rollout_execution, noise, self.exploration)
 
 
 def _collector(
@@ -202,6 +204,10 @@ class Player:
     def visit(self) -> TensorDictBase:
         """Play the teams from their starts (teams, rollout_length); the next call writes over what is returned."""
         return next(self._batches).reshape(-1, self._config.rollout_length)  # collectors side by side are stacked
+
+    def perceive(self, states: States) -> Bag:
+        """Return what the robots perceive in states on any of the training maps."""
+        return self._mixture.perceive(states)
 
     def play(self, beta: float, seed: int, times: int, mining: int, *, only_failed: bool) -> States:
         """Play the teams `times` times for each one that is kept, and return the states of those.

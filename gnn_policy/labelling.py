@@ -67,8 +67,6 @@ class Labeller:
         """
         if not len(states):
             return np.empty(0, np.int8), np.empty(0, np.bool_)
-        if self._solver == "ecbs" and task == "lifelong":
-            return self._next_moves(states), np.ones(len(states), np.bool_)
         if self._solver != "ecbs":
             plans = self.plans(states)
             moves = np.full(states.num_robots, Action.IDLE, np.int8)
@@ -78,26 +76,22 @@ class Labeller:
             return moves, np.array([plan is not None for plan in plans], np.bool_)
         began = self._clock()
         order = self._order(states)
-        labels, solved = experts.relabel(
-            self._problems(states, order),
-            states.positions[order],
-            offsets=states.offsets,
-            w=self._w,
-            node_limit=self._node_limit,
-            **self._where,
-        )
+        if task == "lifelong":
+            labels = experts.next_moves(self._instances(states, order), **self._where)
+            solved = np.ones(len(states), np.bool_)
+        else:
+            labels, solved = experts.relabel(
+                self._problems(states, order),
+                states.positions[order],
+                offsets=states.offsets,
+                w=self._w,
+                node_limit=self._node_limit,
+                **self._where,
+            )
         moves = np.empty(states.num_robots, np.int8)
         moves[order] = labels
         self.seconds += self._clock() - began
         return moves, solved
-
-    def _next_moves(self, states: States) -> npt.NDArray[np.int8]:
-        began = self._clock()
-        order = self._order(states)
-        moves = np.empty(states.num_robots, np.int8)
-        moves[order] = experts.next_moves(self._instances(states, order), **self._where)
-        self.seconds += self._clock() - began
-        return moves
 
     def plans(self, states: States) -> list[Solution | None]:
         """Return the plan from each of T states, or None where the expert did not solve it.

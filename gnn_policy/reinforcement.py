@@ -13,7 +13,7 @@ and Luce 1959 (probabilities of orders).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +31,7 @@ from gnn_policy.labelling import Labeller
 from gnn_policy.network import DecentralizedPolicy
 from gnn_policy.precision import autocast
 from gnn_policy.team_env import ACTION, GOALS, MOVES, POSITIONS, REWARD, states_of
-from mapf_env import Action, Bag, MapSet, States, perceive
+from mapf_env import Action, Bag, States
 
 EXPLORATION = 0.5
 """Temperature of the draws of exploring robots."""
@@ -131,8 +131,6 @@ class Explorer:
     ) -> None:
         self._config, self._policy, self._critic = config, policy, critic
         self._execution = config.rollout_execution
-        self._senses = self._execution.senses(config.policy)
-        self._maps = MapSet(cases.grids, self._senses.fov_radius, "uint8")
         by_task = cases.by_task()
         teams = split_teams(config.rollout_teams, by_task, config.collectors)
         self._players = [
@@ -152,8 +150,10 @@ class Explorer:
 
     def perceive(self, states: States) -> Bag:
         """Return the bag of states as tensors on the policy's device."""
-        on_maps = replace(states, maps=self._maps.index[states.maps])
-        return tensors(perceive(on_maps, self._maps, self._senses), self._policy.head.weight.device)
+        return self._on_device(self._players[0].perceive(states))
+
+    def _on_device(self, bag: Bag) -> Bag:
+        return tensors(bag, self._policy.head.weight.device)
 
     def _experience(self, visited: TensorDictBase, player: Player) -> Experience:
         """Return the experience of B teams over T steps.
@@ -168,20 +168,20 @@ class Explorer:
         there = torch.arange(visited[POSITIONS].shape[2]) < visited["team_size"][..., None]  # (B, T, N)
         order, places = self._choices(visited, there)
         reward = visited["next", REWARD][..., 0][there]
-        cost = -reward
+        lost = -reward.mean().item()
         if player.task == "one_shot":
             on_goal = torch.eq(visited.get(POSITIONS), visited.get(GOALS)).all(-1)
             left = on_goal & ~on_goal.roll(-1, 1) & ~last[..., None]
-            cost = cost + DISPLACEMENT * left[there]
+            reward = reward - DISPLACEMENT * left[there]
         log_prob, value, explored, shared = [], [], [], []
         for part, rows in _in_parts(states):
-            bag = self.perceive(part)
-            logits, predicted = self._evaluate(bag)
+            bag = player.perceive(part)
+            logits, predicted = self._evaluate(self._on_device(bag))
             log_prob.append(log_probability(logits, order[rows], places[rows]))
             value.append(predicted)
             facts = facts_of(bag, self._execution, self._config.policy)
             explored.append(torch.from_numpy(~self._execution.draws(facts.alarmed)))
-            shared.append(self._shared(bag, part, -cost[rows]))
+            shared.append(self._shared(bag, part, reward[rows]))
         learned = torch.zeros_like(there)
         learned[there] = torch.cat(explored)
         learned[last] = False
@@ -204,7 +204,7 @@ class Explorer:
             torch.cat(log_prob),
             _scaled(advantage, learned)[there],
             target[there],
-            -reward.mean().item(),
+            lost,
         )
 
     def _choices(self, visited: TensorDictBase, there: Tensor) -> tuple[Tensor, Tensor]:
@@ -223,7 +223,7 @@ class Explorer:
         return logits.cpu(), value.cpu()
 
     def _shared(self, bag: Bag, states: States, reward: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
-        sender, receiver = bag.edge_index.cpu()
+        sender, receiver = torch.from_numpy(bag.edge_index)
         positions = torch.from_numpy(states.positions)
         near = (positions[sender] - positions[receiver]).abs().sum(1) <= _NEAR
         share = self._config.neighbour_share * reward[sender[near]]

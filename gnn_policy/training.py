@@ -26,6 +26,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -169,22 +170,19 @@ class Training:
     def _run(self) -> None:
         config, first = self.config, self.process.rank == 0
         references = self._reference_sets() if first else None
-        batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
-        collector = (
-            Explorer(config, self.policy, self.critic, self._labeller, self._cases)
-            if config.objective == "delay"
-            else Demonstrator(config, self._player, self._labeller, self._cases, self.process)
-        )
+        if config.objective == "delay":
+            collector = Explorer(config, self.policy, self.critic, self._labeller, self._cases)
+            collect_and_fit = partial(self._explore_and_fit, collector)
+        else:
+            collector = Demonstrator(config, self._player, self._labeller, self._cases, self.process)
+            batches = BatchMaker(self._cases.grids, config.policy, augment=config.augment)
+            collect_and_fit = partial(self._demonstrate_and_fit, collector, batches)
         torch.set_num_threads(self.threads)  # collectors in processes of their own take threads away from this one
         writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=len(self.history)) if first else None
         torch.set_flush_denormal(True)  # the weights of units that are never active decay to such numbers
         try:
             for number in range(len(self.history), config.rounds):
-                row = (
-                    self._explore_and_fit(number, collector)
-                    if isinstance(collector, Explorer)
-                    else self._demonstrate_and_fit(number, collector, batches)
-                )
+                row = collect_and_fit(number)
                 self.scheduler.step()
                 if references is not None and (
                     (number + 1) % config.validate_every == 0 or number + 1 == config.rounds
@@ -227,7 +225,7 @@ class Training:
                 )
         return sets
 
-    def _explore_and_fit(self, number: int, explorer: Explorer) -> Round:
+    def _explore_and_fit(self, explorer: Explorer, number: int) -> Round:
         config, began = self.config, self._clock()
         self.progress.phase(number, "collecting")
         collected = explorer.collect(number, config.dagger_steps)
@@ -281,7 +279,7 @@ class Training:
             **figures,
         )
 
-    def _demonstrate_and_fit(self, number: int, demonstrator: Demonstrator, batches: BatchMaker) -> Round:
+    def _demonstrate_and_fit(self, demonstrator: Demonstrator, batches: BatchMaker, number: int) -> Round:
         config = self.config
         began, expert_seconds, unlabelled = self._clock(), self._labeller.seconds, 0
         if self._collects(number):
