@@ -65,7 +65,8 @@ class Pilot:
         self._round, self._under_way = 0, 0
         self._early: list[Frame] = []
         self._messages: dict[int, Message] = {}
-        self._heard: set[int] = set()
+        self._heard: dict[int, int] = {}
+        """Of robots within two cells, the latest round of this step in which they spoke."""
         self._told = False
 
     def begin(self, sensed: Sensed) -> None:
@@ -78,6 +79,7 @@ class Pilot:
         centre = sensed.view.shape[-1] // 2
         self._under_way = 0 if sensed.view[1, centre, centre] else self._under_way + 1
         self._sensed, self._round, self._reservation, self._told = sensed, 0, None, False
+        self._heard = {}
         self._open_round()
 
     @property
@@ -95,7 +97,7 @@ class Pilot:
     def complete(self) -> bool:
         """True if all that can come in this round has come."""
         if self._reservation is not None:
-            return self._reservation.heard_all(self._heard)
+            return self._reservation.heard_all({name for name, last in self._heard.items() if last >= self._round})
         return self._messages.keys() >= self.robot.links.keys()
 
     def outgoing(self) -> tuple[bytes, list[int]] | None:
@@ -132,7 +134,7 @@ class Pilot:
         self._open_round()
 
     def _open_round(self) -> None:
-        self._messages, self._heard = {}, set()
+        self._messages = {}
         if self._round == self.robot.rounds:
             self._decide()
         early, self._early = self._early, []
@@ -173,8 +175,7 @@ class Pilot:
                 self._reservation.hear(frame.sender, frame.body)
             except ValueError as fault:
                 raise FrameError(f"damaged: {fault}") from fault
-            if frame.round >= self._round:
-                self._heard.add(frame.sender)
+            self._heard[frame.sender] = max(frame.round, self._heard.get(frame.sender, 0))
         elif (frame.step, frame.round) == (step, self._round) and self._reservation is None:
             self._hear(frame)
         elif (frame.step, frame.round) < (step, self._round):

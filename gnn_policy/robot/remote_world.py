@@ -85,23 +85,26 @@ class RemoteDriver:
         self._ask(f"mapf/join/{number}", Frame(Content.READY, number, 0, 0, b""))
 
     def sense(self, timeout: float) -> Sensed | None:
-        """Return what is perceived at the start of the next step, or None if none begins within `timeout` seconds.
+        """Return what is perceived at the start of the latest step that this robot has not taken part in, or None if
+        none begins within `timeout` seconds.
 
         Raises:
             EndOfWorld: If the world has ended.
             ConnectionError: If it is gone without a word.
         """
-        until = time.monotonic() + timeout
+        until, newest = time.monotonic() + timeout, None
         while (left := until - time.monotonic()) > 0:
-            if (data := self._inbox.get(min(left, 0.2))) is not None:
+            if (data := self._inbox.get(0.0 if newest else min(left, 0.2))) is not None:
                 try:
                     frame = self.seal.unpack(data)
-                    if frame.content is Content.END:
-                        raise EndOfWorld
-                    if frame.content is Content.SENSED:
-                        return Sensed.from_bytes(frame.body, self._policy, self._execution)
                 except FrameError:  # not of the world: it says nothing about the step
                     continue
+                if frame.content is Content.END:
+                    raise EndOfWorld
+                if frame.content is Content.SENSED:
+                    newest = frame.body
+            elif newest is not None:
+                return Sensed.from_bytes(newest, self._policy, self._execution)
             elif self._gone.is_set():
                 raise ConnectionError("the world is gone without having ended")
         return None
