@@ -1,6 +1,7 @@
-"""Two processes that train one policy, as torchrun starts them."""
+"""Two processes that train one policy, as torchrun starts them on one machine, or on two that are agents here."""
 
 import os
+import socket
 import subprocess
 import sys
 
@@ -37,6 +38,8 @@ class Progress(TrainingProgress):
         return True  # every update, however fast the machine
     def fitted(self, number, update, *rest):
         if process.rank == victim and number == when and update == 2:
+            if process.local_count == 1:
+                os.kill(os.getppid(), signal.SIGKILL)  # the agent: the whole machine is gone
             os.kill(os.getpid(), signal.SIGKILL)
 
 with join_processes() as process:
@@ -48,14 +51,34 @@ threads = sorted(each.joinpath("comm").read_text() for each in tasks.iterdir()) 
 """
 
 
-def launch(tmp_path, name, *, victim=-1, when=-1, config=CONFIG):
+def launch(tmp_path, name, *, machines=1, victim=-1, when=-1, config=CONFIG):
+    """Run two processes, on one machine or one on each of two; return the exit status and errors of each agent."""
     script = tmp_path / "worker.py"
     script.write_text(WORKER)
     config.save(tmp_path / "settings.toml")
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    if machines == 1:
+        placed = [["--standalone", "--nproc-per-node", "2"]]
+    else:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        master = ["--nnodes", "2", "--nproc-per-node", "1", "--master-addr", "127.0.0.1", "--master-port", str(port)]
+        placed = [[*master, "--node-rank", str(rank), "--local-addr", "127.0.0.1"] for rank in range(2)]
     arguments = [str(tmp_path / name), str(victim), str(when), str(tmp_path / "settings.toml")]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True, timeout=300)
+    loopback = "lo0" if sys.platform == "darwin" else "lo"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": loopback}
+    agents = [
+        subprocess.Popen(
+            [sys.executable, "-m", "torch.distributed.run", *where, str(script), *arguments],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for where in placed
+    ]
+    errors = [agent.communicate(timeout=300)[1] for agent in agents]
+    return [agent.returncode for agent in agents], "".join(errors)
 
 
 def report(tmp_path, name, rank, number):
@@ -71,8 +94,8 @@ def assert_equal(one, two):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     home = tmp_path_factory.mktemp("process")
-    done = launch(home, "whole")
-    assert done.returncode == 0, done.stderr
+    ended, errors = launch(home, "whole")
+    assert ended == [0], errors
     return home
 
 
@@ -106,14 +129,15 @@ def test_the_state_and_the_best_policy_are_those_of_the_team(whole):
     assert state["history"][-1]["samples"] == 3 * 3 * CONFIG.batch_size * CONFIG.num_agents
 
 
-@pytest.mark.parametrize(("victim", "when"), [(0, 1), (1, 2)])
-def test_a_run_with_a_killed_process_resumes_and_ends_the_same(whole, tmp_path, victim, when):
-    killed = launch(tmp_path, "torn", victim=victim, when=when)
-    assert killed.returncode != 0
+@pytest.mark.parametrize(("machines", "victim", "when"), [(1, 0, 1), (2, 1, 2)])
+def test_a_run_with_a_killed_process_or_machine_resumes_and_ends_the_same(whole, tmp_path, machines, victim, when):
+    ended, _ = launch(tmp_path, "torn", machines=machines, victim=victim, when=when)
+    assert len(ended) == machines
+    assert 0 not in ended
     assert (tmp_path / "torn" / "state.pt").exists()
     assert not (tmp_path / f"torn-0-{when}.pt").exists()
-    again = launch(tmp_path, "torn")
-    assert again.returncode == 0, again.stderr
+    ended, errors = launch(tmp_path, "torn", machines=machines)
+    assert ended == [0] * machines, errors
     for rank in range(2):
         assert_equal(report(tmp_path, "torn", rank, 2), report(whole, "whole", rank, 2))
     states = [torch.load(home / "state.pt", weights_only=True) for home in (tmp_path / "torn", whole / "whole")]
