@@ -24,7 +24,7 @@ def released_encoder(channels: int, side: int, features: int) -> nn.Sequential:
     """The CNN of the paper's released code for views (M, channels, side, side), to (M, features)."""
     layers: list[nn.Module] = []
     for width, pool in ((32, True), (32, False), (64, True), (64, False), (128, True)):
-        layers += [nn.Conv2d(channels, width, 3, padding=1), nn.BatchNorm2d(width), nn.ReLU()]
+        layers += [nn.Conv2d(channels, width, 3, padding=1), nn.BatchNorm2d(width), nn.ReLU(inplace=True)]
         if pool:
             layers.append(nn.MaxPool2d(2))
             side //= 2
@@ -43,16 +43,16 @@ def lean_encoder(channels: int, side: int, features: int) -> nn.Sequential:
     return nn.Sequential(
         StridedConvolution(channels, 48),
         nn.BatchNorm2d(48),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         StridedConvolution(48, 64),
         nn.BatchNorm2d(64),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         *last,
         nn.BatchNorm1d(128) if kernel == side else nn.BatchNorm2d(128),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Flatten(),
         nn.Linear(128 * (side - kernel + 1) ** 2, features),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
     )
 
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdlib>
 #include <limits>
 #include <numeric>
 #include <utility>
@@ -171,6 +172,16 @@ void find_edges(const Layout& layout, const std::int32_t* positions, int num_age
             for (int j = 0; j < num_agents; ++j) add(i, j);
         return;
     }
+    // In a row that is `down` rows away, robots hear up to spans[down] columns away.
+    std::vector<int> spans(reach + 1);
+    double heard = 0.0;  // cells
+    for (int down = 0; down <= reach; ++down) {
+        const double left = static_cast<double>(limit) - static_cast<double>(down) * down;
+        spans[down] = left > 0.0 ? static_cast<int>(std::min(std::ceil(std::sqrt(left)), longest)) : -1;
+        heard += (down == 0 ? 1.0 : 2.0) * std::max(2.0 * spans[down] + 1.0, 0.0);
+    }
+    const double share = num_agents / (static_cast<double>(layout.height) * layout.width);
+    edges.reserve(edges.size() + static_cast<std::size_t>(num_agents * heard * share));  // as of robots spread evenly
     standing.resize(std::max<std::size_t>(standing.size(), layout.size()), -1);
     for (int i = 0; i < num_agents; ++i) standing[layout.cell(positions[2 * i], positions[2 * i + 1])] = i;
     const std::size_t before = edges.size();
@@ -180,10 +191,12 @@ void find_edges(const Layout& layout, const std::int32_t* positions, int num_age
         const int i = order ? order[k] : k;
         const std::size_t first = edges.size();
         const int row = positions[2 * i], col = positions[2 * i + 1];
-        const int left = std::max(col - reach, 0), right = std::min(col + reach, layout.width - 1);
-        for (int r = std::max(row - reach, 0); r <= std::min(row + reach, layout.height - 1); ++r)
-            for (int c = left; c <= right; ++c)
-                if (const int j = standing[layout.cell(r, c)]; j >= 0) add(i, j);
+        for (int r = std::max(row - reach, 0); r <= std::min(row + reach, layout.height - 1); ++r) {
+            const int span = spans[std::abs(r - row)];
+            const int* const there = standing.data() + layout.cell(r, 0);
+            for (int c = std::max(col - span, 0); c <= std::min(col + span, layout.width - 1); ++c)
+                if (const int j = there[c]; j >= 0) add(i, j);
+        }
         std::sort(edges.begin() + static_cast<std::ptrdiff_t>(first), edges.end(),
                   [](const Edge& one, const Edge& other) { return one.sender < other.sender; });
         if (order == nullptr) continue;
