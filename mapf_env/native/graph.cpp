@@ -174,14 +174,10 @@ void find_edges(const Layout& layout, const std::int32_t* positions, int num_age
     }
     // In a row that is `down` rows away, robots hear up to spans[down] columns away.
     std::vector<int> spans(reach + 1);
-    double heard = 0.0;  // cells
     for (int down = 0; down <= reach; ++down) {
         const double left = static_cast<double>(limit) - static_cast<double>(down) * down;
         spans[down] = left > 0.0 ? static_cast<int>(std::min(std::ceil(std::sqrt(left)), longest)) : -1;
-        heard += (down == 0 ? 1.0 : 2.0) * std::max(2.0 * spans[down] + 1.0, 0.0);
     }
-    const double share = num_agents / (static_cast<double>(layout.height) * layout.width);
-    edges.reserve(edges.size() + static_cast<std::size_t>(num_agents * heard * share));  // as of robots spread evenly
     standing.resize(std::max<std::size_t>(standing.size(), layout.size()), -1);
     for (int i = 0; i < num_agents; ++i) standing[layout.cell(positions[2 * i], positions[2 * i + 1])] = i;
     const std::size_t before = edges.size();

@@ -9,8 +9,11 @@ from hypothesis import strategies as st
 import bags
 import oracles
 from gnn_policy import DecentralizedPolicy, Execution, PolicyConfig, rollout
+from gnn_policy.robot.frame import Seal
+from gnn_policy.robot.pilot import Pilot
 from gnn_policy.robot.radio import Ether, Faults
 from gnn_policy.robot.rehearsal import rehearse
+from gnn_policy.robot.robot import Robot
 from gnn_policy.robot.world import CollisionError, World
 from mapf_env import Instance, random_instance
 
@@ -116,6 +119,41 @@ def test_a_message_of_the_policy_that_is_late_counts_as_lost(policy, monkeypatch
     assert np.array_equal(slow.solution.paths, mute.solution.paths)
     assert slow.dropped["late"] > 50
     assert not np.array_equal(whole.solution.paths, mute.solution.paths)
+
+
+def test_no_robot_waits_for_a_deadline_where_nothing_is_lost(policy):
+    """Robots go on in any order, some a round ahead of others; each is over at last by what it has heard."""
+    random, case = np.random.default_rng(0), random_instance(height=5, width=5, density=0, num_agents=8, seed=3)
+    world = World(case, policy.config, Execution(), max_steps=40)
+    pilots = [
+        Pilot(Robot(policy, seed=number), number, Seal(b"key", 1), reservation_rounds=2)
+        for number in range(case.num_agents)
+    ]
+    ahead = 0
+    while world.running:
+        sensed, moves = world.sense(), {}
+        came, rounds, speaks = [[] for _ in pilots], [0] * len(pilots), [True] * len(pilots)
+        for number, pilot in enumerate(pilots):
+            pilot.begin(sensed[number])
+        for number in random.integers(0, len(pilots), 4000):
+            pilot = pilots[number]
+            if pilot.over:
+                continue
+            if speaks[number]:
+                data, receivers = pilot.outgoing()
+                for receiver in receivers:
+                    came[receiver].append(data)
+                speaks[number] = False
+            while came[number]:
+                pilot.receive(came[number].pop(0))
+            if pilot.complete:
+                pilot.close_round(lambda move, number=number: moves.setdefault(number, move) == move)
+                rounds[number], speaks[number] = rounds[number] + 1, True
+                ahead += max(rounds) - min(rounds) > 1
+        assert all(pilot.over for pilot in pilots)
+        world.execute(moves)
+    assert ahead > 20
+    assert not any(pilot.dropped["early"] for pilot in pilots)
 
 
 @pytest.mark.parametrize("precision", ["float16", "int8"])
