@@ -1,16 +1,19 @@
 """A swarm over a bad radio, without a member, in fewer bits and as processes: `python benchmarks/swarm.py PART`.
 
-The parts are `radio` (loss, delay and a crash), `bits` (numbers of the messages) and `processes` (time of a step). Each
-prints a table in Markdown. A collision would end the run with an error.
+The parts are `radio` (loss, delay and a crash), `bits` (numbers of the messages), `processes` (time of a step) and
+`robot` (one robot alone: start, memory, time of its step). Each prints a table in Markdown. A collision would end the
+run with an error.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import secrets
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -28,6 +31,35 @@ from mapf_env import Instance, random_instance
 
 ROBOTS, SIDE, DENSITY, MAX_STEPS = 12, 20, 0.2, 128
 CRASH_STEP = 5
+ROBOT_ALONE = """
+import json, resource, statistics, sys, time
+name, runtime, started = sys.argv[1], sys.argv[2], float(sys.argv[3])
+if runtime == "torch":
+    import torch, gnn_policy
+    torch.set_num_threads(1)
+    policy = gnn_policy.load(name)
+else:
+    from gnn_policy.robot.exported import ExportedPolicy
+    policy = ExportedPolicy(name)
+from gnn_policy.robot.robot import Robot
+from gnn_policy.robot.world import World
+from mapf_env import random_instance
+robot, parts = Robot(policy), policy.parts()
+start = time.time() - started
+team = random_instance(height=4, width=4, density=0, num_agents=9, seed=0)
+sensed = World(team, parts.config, parts.execution).sense()[0]
+times = []
+for _ in range(330):
+    before = time.perf_counter()
+    robot.begin(sensed.view, sensed.links, sensed.cell, scalars=sensed.scalars, edge_attr=sensed.edge_attr)
+    for _ in range(robot.rounds):
+        robot.hear(dict.fromkeys(sensed.links, robot.message))
+    robot.act()
+    times.append(time.perf_counter() - before)
+memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+print(json.dumps([start, memory, len(sensed.links), 1000 * statistics.median(times[30:])]))
+"""
+"""Run in a process of its own with a policy, "torch" or "onnx", and the time at which it was started."""
 
 
 def cases(count: int, robots: int = ROBOTS) -> list[Instance]:
@@ -126,9 +158,21 @@ def processes(policy: ExportedPolicy, steps: int, sizes: tuple[int, ...] = (4, 1
         print(f"| {size} | {np.median(times):.0f} | {np.quantile(times, 0.9):.0f} |", flush=True)
 
 
+def robot_alone(exported: Path, name: str, starts: int = 5) -> None:
+    """The table of one robot, once without torch and once with it."""
+    print("| runtime | start, s | memory, MB | neighbours | ms per step |\n|---|---|---|---|---|")
+    for runtime, policy in (("onnx", str(exported)), ("torch", name)):
+        measured = []
+        for _ in range(starts):
+            command = [sys.executable, "-c", ROBOT_ALONE, policy, runtime, str(time.time())]
+            measured.append(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+        start, memory, neighbours, step = np.median(measured, axis=0)
+        print(f"| {runtime} | {start:.1f} | {memory:.0f} | {neighbours:.0f} | {step:.2f} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("radio", "bits", "processes"))
+    parser.add_argument("part", choices=("radio", "bits", "processes", "robot"))
     parser.add_argument("--policy", default="general", help="a policy, exported first, or a folder of an exported one")
     parser.add_argument("--cases", type=int, default=50, help="instances for each row (default: 50)")
     parser.add_argument("--steps", type=int, default=20, help="steps that processes go (default: 20)")
@@ -142,6 +186,8 @@ def main() -> None:
         policy = ExportedPolicy(exported)
         if options.part == "processes":
             processes(policy, options.steps)
+        elif options.part == "robot":
+            robot_alone(exported, options.policy)
         else:
             {"radio": radio, "bits": bits}[options.part](policy, options.cases)
 
