@@ -157,9 +157,9 @@ void find_edges(const Layout& layout, const std::int32_t* positions, int num_age
                 double loss, std::uint64_t key, std::vector<int>& standing, std::vector<Edge>& edges,
                 const int* order) {
     const float limit = least_too_far(radius);
-    const auto add = [&](int i, int j) {
-        const float down = static_cast<float>(positions[2 * i]) - static_cast<float>(positions[2 * j]);
-        const float right = static_cast<float>(positions[2 * i + 1]) - static_cast<float>(positions[2 * j + 1]);
+    const auto add = [&](int i, int j, int row, int col) {  // j stands at (row, col)
+        const float down = static_cast<float>(positions[2 * i]) - static_cast<float>(row);
+        const float right = static_cast<float>(positions[2 * i + 1]) - static_cast<float>(col);
         const float square = down * down + right * right;
         if (!(square < limit) || i == j || (loss > 0.0 && is_lost(key, i, j, loss))) return;
         edges.push_back({i, j, weights == Weights::binary ? 1.0f : 1.0f / std::sqrt(square)});
@@ -169,7 +169,7 @@ void find_edges(const Layout& layout, const std::int32_t* positions, int num_age
     const double side = 2.0 * reach + 1.0;
     if (num_agents <= std::min<double>(side, layout.height) * std::min<double>(side, layout.width)) {
         for (int i = 0; i < num_agents; ++i)
-            for (int j = 0; j < num_agents; ++j) add(i, j);
+            for (int j = 0; j < num_agents; ++j) add(i, j, positions[2 * j], positions[2 * j + 1]);
         return;
     }
     // In a row that is `down` rows away, robots hear up to spans[down] columns away.
@@ -191,7 +191,7 @@ void find_edges(const Layout& layout, const std::int32_t* positions, int num_age
             const int span = spans[std::abs(r - row)];
             const int* const there = standing.data() + layout.cell(r, 0);
             for (int c = std::max(col - span, 0); c <= std::min(col + span, layout.width - 1); ++c)
-                if (const int j = there[c]; j >= 0) add(i, j);
+                if (const int j = there[c]; j >= 0) add(i, j, r, c);
         }
         std::sort(edges.begin() + static_cast<std::ptrdiff_t>(first), edges.end(),
                   [](const Edge& one, const Edge& other) { return one.sender < other.sender; });

@@ -130,10 +130,16 @@ private:
     // be as long as the team is large, so they are on a stack of their own.
     template <class Swaps>
     bool plan(int robot, int pusher, const Swaps& swaps) {
-        plans_.clear();
-        plans_.push_back(plan_of(robot, pusher, swaps));
+        Plan first = plan_of(robot, pusher, swaps);
+        int pushed = nobody;
+        const bool goes = advance(first, pushed);
+        if (pushed == nobody) {  // as nearly always: no stack is needed
+            if (!goes) step_back(first);
+            return goes;
+        }
+        plans_.assign({first, plan_of(pushed, robot, swaps)});
         while (true) {
-            int pushed = nobody;
+            pushed = nobody;
             const bool moves = advance(plans_.back(), pushed);
             if (pushed != nobody) {  // 3. Priority inheritance: a robot that stands there has to find a move of its own.
                 plans_.push_back(plan_of(pushed, plans_.back().robot, swaps));

@@ -80,6 +80,10 @@ public:
         place_table(layout_, shape, row, col, corner);
         for (int r = corner[0]; r < corner[0] + shape.rows; ++r) {
             const int first = r * layout_.stride() + corner[1];
+            if (by_words()) {
+                table = std::copy_n(found_.data() + first, shape.cols, table);
+                continue;
+            }
             for (int c = 0; c < shape.cols; ++c) {
                 reach(first + c);
                 *table++ = value(first + c);
@@ -91,13 +95,16 @@ private:
     static constexpr int nobody = -1;
     static constexpr std::size_t most_by_words = 64 * 20;
 
-    // Obstacles hold 0, so that one comparison without a branch tells what is new.
+    // On small maps all of the search at once is quicker than a part, and `found_` is what is asked for.
+    bool by_words() const { return std::endian::native == std::endian::little && layout_.size() <= most_by_words; }
+
+    // Elsewhere obstacles hold 0, so that one comparison without a branch tells what is new.
     Distance value(int cell) const { return found_[cell] == 0 && cell != goal_ ? unreachable : found_[cell]; }
 
     void begin(int goal) {
         if (goal == goal_) return;
         const std::size_t size = layout_.size();
-        if (std::endian::native == std::endian::little && size <= most_by_words) {  // all of it is quicker than a part
+        if (by_words()) {
             if (!is_read_) small_.emplace(grid_of(layout_, obstacles_));
             is_read_ = true;
             distances_to(*small_, goal, found_, open_);
