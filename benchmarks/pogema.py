@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from hashlib import blake2b
 from pathlib import Path
@@ -28,6 +29,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 import pogema_methods
+from experts.cluster import connect
 from gnn_policy.command_line import run_command
 from gnn_policy.cores import cpu_threads
 from gnn_policy.metrics import Estimate
@@ -42,8 +44,8 @@ LIFELONG_STEPS = 256
 """The length of an episode in POGEMA's lifelong benchmark."""
 LIFELONG_RESULTS = Path(__file__).with_name("pogema_lifelong.csv")
 """Means of published lifelong results, some team sizes of each set."""
-BATCH = 32
-"""Teams that are played at a time, between two steps of the progress bar."""
+BATCH, BATCH_OF_CLUSTER = 32, 512
+"""Teams that are played at a time, between two steps of the progress bar: here, and on a cluster."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,9 @@ class Options:
     """Random seed for sampling, PIBT's order and LaCAM."""
     threads: int = 1
     """CPU threads of the network; 0 takes all that the process may use."""
+    cluster: str | None = None
+    """Address of a Ray cluster that plays one-shot teams of policies, PIBT and greedy robots: "auto" for the cluster of
+    this machine, or "local" for as many processes here as there are threads. Needs the extra `cluster`."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,9 @@ def plan(options: Options) -> list[Cell]:
     wrong = [size for size in options.sizes if size < 1]
     if wrong:
         raise ValueError(f"--sizes must be at least 1, got {wrong[0]}")
-    methods = [pogema_methods.method_named(words) for words in options.methods]
+    if options.cluster is not None and options.lifelong:
+        raise ValueError("--cluster plays one-shot teams: leave it out with --lifelong")
+    methods = [pogema_methods.method_named(words, options.cluster) for words in options.methods]
     names = [method.name for method in methods]
     endless = [method.name for method in methods if method.serve is None] if options.lifelong else []
     if endless:
@@ -148,8 +155,8 @@ def _cell(options: Options, group: BenchmarkSet, size: int, cases: tuple[Case, .
     return Cell(path, method, group, size, cases, settings)
 
 
-def play(cells: Sequence[Cell], seed: int, console: Console) -> None:
-    """Play what has no result yet; each result is written as soon as it is there."""
+def play(cells: Sequence[Cell], seed: int, console: Console, size: int = BATCH) -> None:
+    """Play what has no result yet, `size` teams at a time; each result is written as soon as it is there."""
     todo = [cell for cell in cells if not cell.path.exists()]
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("", total=sum(len(cell.cases) for cell in todo))
@@ -157,8 +164,8 @@ def play(cells: Sequence[Cell], seed: int, console: Console) -> None:
             progress.update(task, description=cell.title)
             play_batch = _serve if cell.settings["task"] == "lifelong" else _play
             parts, seconds = [], 0.0
-            for first in range(0, len(cell.cases), BATCH):
-                batch = cell.cases[first : first + BATCH]
+            for first in range(0, len(cell.cases), size):
+                batch = cell.cases[first : first + size]
                 began = time.perf_counter()
                 parts.append(play_batch(cell, batch, seed))
                 seconds += time.perf_counter() - began
@@ -244,7 +251,8 @@ def main(options: Options) -> None:
         known = ", ".join(sorted({row.method for row in published}))
         raise ValueError(f"--published: nobody has published a method {min(unknown)!r}: choose among {known}")
     cells = plan(options)
-    play(cells, options.seed, console)
+    with nullcontext() if options.cluster is None else connect(options.cluster, workers=torch.get_num_threads()):
+        play(cells, options.seed, console, BATCH if options.cluster is None else BATCH_OF_CLUSTER)
     shown = [row for row in published if not options.published or row.method in options.published]
     show([score(cell) for cell in cells], shown, options.out / ("lifelong" if options.lifelong else "mapf"), console)
 

@@ -22,6 +22,8 @@ from gnn_policy.rollout import PolicyActor
 from mapf_env import BatchedEnv, Instance, instance_hash
 from mapf_env.config import Shield
 
+TEAMS_AT_A_TIME, TEAMS_OF_A_WORKER = 256, 8
+"""Teams that are played in one batch here, and on a cluster; outcomes do not depend on it."""
 FIRST_PLAN_LIMIT = 2.0
 """Seconds that LaCAM may take for a plan where no time is given."""
 
@@ -56,8 +58,12 @@ class Method:
     in, the number of arrivals of each out; None if the method cannot."""
 
 
-def method_named(words: str) -> Method:
+def method_named(words: str, cluster: str | None = None) -> Method:
     """Return the method of the given words.
+
+    Args:
+        words: Its name and options.
+        cluster: The address of a Ray cluster that plays one-shot teams of policies, PIBT and greedy robots.
 
     Raises:
         ValueError: If an option is unknown, or a policy is damaged.
@@ -65,14 +71,14 @@ def method_named(words: str) -> Method:
     """
     name, _, options = ("", "", "") if Path(words).exists() else words.partition(",")
     if name in SHIELDS and not options:
-        return _step_by_step(name, {}, GreedyActor(shield=SHIELDS[name]))
+        return _step_by_step(name, {}, GreedyActor(shield=SHIELDS[name]), cluster)
     if name == "lacam":
         return _lacam(words, options)
     if name == "rolling":
         return _rolling(words, options)
     if name in SHIELDS:
         raise ValueError(f"{name} has no options, got {words!r}")
-    return _policy(name or words, options)
+    return _policy(name or words, options, cluster)
 
 
 SHIELDS: dict[str, Shield] = {"greedy": "idle", "pibt": "pibt", "pibt_swap": "pibt_swap"}
@@ -80,19 +86,20 @@ SHIELDS: dict[str, Shield] = {"greedy": "idle", "pibt": "pibt", "pibt_swap": "pi
 swap (Okumura 2023)."""
 
 
-def _policy(path: str, row: str) -> Method:
+def _policy(path: str, row: str, cluster: str | None) -> Method:
     policy = checkpoint.load(path)
     execution = Execution.parse(row, policy.execution) if row else policy.execution
     name = f"{Path(path).name.removesuffix('.safetensors')} {execution.name}"
     settings = {"policy": checkpoint.fingerprint(policy), "row": execution.name}
-    return _step_by_step(name, settings, PolicyActor(policy.eval(), execution))
+    return _step_by_step(name, settings, PolicyActor(policy.eval(), execution), cluster)
 
 
-def _step_by_step(name: str, settings: Mapping[str, object], actor: Actor) -> Method:
+def _step_by_step(name: str, settings: Mapping[str, object], actor: Actor, cluster: str | None) -> Method:
     """Play by an actor in the environment, so that teams that fail have paths, too."""
 
     def play(instances: Sequence[Instance], max_steps: int, seed: int) -> Played:
-        played = rollout(actor, instances, seed=seed, max_steps=max_steps)
+        size = TEAMS_AT_A_TIME if cluster is None else TEAMS_OF_A_WORKER
+        played = rollout(actor, instances, seed=seed, max_steps=max_steps, batch_size=size, cluster=cluster)
         steps = np.array([len(solution.paths) - 1 for solution in played.solutions], np.int64)
         return Played(played.success, played.on_goal, played.flowtime, played.makespan, steps)
 

@@ -28,6 +28,7 @@ from gnn_policy import evaluate
 from gnn_policy.progress import TrainingProgress
 from gnn_policy.training import Training
 from mapf_env import Instance, random_instance
+from pogema_methods import method_named
 from small_training import CONFIG, CROWDS
 
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra cluster")
@@ -215,6 +216,15 @@ def test_evaluation_writes_the_same_file(workers: cluster.Workers, tmp_path: Pat
     results = [(tmp_path / name / "results.json").read_bytes() for name in ("one", "cluster")]
     assert results[0] == results[1]
     assert json.loads(results[0])["tables"]
+
+
+@pytest.mark.parametrize("words", ["n4", "pibt_swap"])
+def test_methods_of_the_benchmark_play_as_on_one_machine(workers: cluster.Workers, words: str) -> None:
+    torch.set_num_threads(1)
+    one, other = (method_named(words, where).play(INSTANCES, 20, 0) for where in ("local", None))
+    for each in fields(one):
+        assert np.array_equal(getattr(one, each.name), getattr(other, each.name)), each.name
+    assert one.home.any()
 
 
 @pytest.mark.parametrize("config", [CONFIG, CROWDS], ids=["visited", "plans"])

@@ -85,8 +85,9 @@ class RemoteDriver:
         self._ask(f"mapf/join/{number}", Frame(Content.READY, number, 0, 0, b""))
 
     def sense(self, timeout: float) -> Sensed | None:
-        """Return what is perceived at the start of the latest step that this robot has not taken part in, or None if
-        none begins within `timeout` seconds.
+        """Return what is perceived at the start of the newest step, or None if none begins within `timeout` seconds.
+
+        Steps that went by while the robot was late are skipped.
 
         Raises:
             EndOfWorld: If the world has ended.

@@ -147,7 +147,7 @@ def test_no_robot_waits_for_a_deadline_where_nothing_is_lost(policy):
             while came[number]:
                 pilot.receive(came[number].pop(0))
             if pilot.complete:
-                pilot.close_round(lambda move, number=number: moves.setdefault(number, move) == move)
+                pilot.close_round(lambda move, number=number, moves=moves: moves.setdefault(number, move) == move)
                 rounds[number], speaks[number] = rounds[number] + 1, True
                 ahead += max(rounds) - min(rounds) > 1
         assert all(pilot.over for pilot in pilots)
