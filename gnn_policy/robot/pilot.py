@@ -66,7 +66,7 @@ class Pilot:
         self._early: list[Frame] = []
         self._messages: dict[int, Message] = {}
         self._heard: dict[int, int] = {}
-        """Of robots within two cells, the latest round of this step in which they spoke."""
+        """The latest round of this step in which each robot within two cells spoke."""
         self._told = False
 
     def begin(self, sensed: Sensed) -> None:
