@@ -77,7 +77,8 @@ class Options:
     """CPU threads of the network; 0 takes all that the process may use."""
     cluster: str | None = None
     """Address of a Ray cluster that plays one-shot teams of policies, PIBT and greedy robots: "auto" for the cluster of
-    this machine, or "local" for as many processes here as there are threads. Needs the extra `cluster`."""
+    this machine, or "local" for as many processes here as there are threads. Seconds a step are then those of the whole
+    cluster. Needs the extra `cluster`."""
 
 
 @dataclass(frozen=True)

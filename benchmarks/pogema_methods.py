@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +23,8 @@ from gnn_policy.rollout import PolicyActor
 from mapf_env import BatchedEnv, Instance, instance_hash
 from mapf_env.config import Shield
 
-TEAMS_AT_A_TIME, TEAMS_OF_A_WORKER = 256, 8
-"""Teams that are played in one batch here, and on a cluster; outcomes do not depend on it."""
+TEAMS_OF_A_WORKER = 8
+"""Teams that a worker of a cluster plays at a time; outcomes do not depend on it."""
 FIRST_PLAN_LIMIT = 2.0
 """Seconds that LaCAM may take for a plan where no time is given."""
 
@@ -97,9 +98,10 @@ def _policy(path: str, row: str, cluster: str | None) -> Method:
 def _step_by_step(name: str, settings: Mapping[str, object], actor: Actor, cluster: str | None) -> Method:
     """Play by an actor in the environment, so that teams that fail have paths, too."""
 
+    where: dict[str, Any] = {} if cluster is None else {"cluster": cluster, "batch_size": TEAMS_OF_A_WORKER}
+
     def play(instances: Sequence[Instance], max_steps: int, seed: int) -> Played:
-        size = TEAMS_AT_A_TIME if cluster is None else TEAMS_OF_A_WORKER
-        played = rollout(actor, instances, seed=seed, max_steps=max_steps, batch_size=size, cluster=cluster)
+        played = rollout(actor, instances, seed=seed, max_steps=max_steps, **where)
         steps = np.array([len(solution.paths) - 1 for solution in played.solutions], np.int64)
         return Played(played.success, played.on_goal, played.flowtime, played.makespan, steps)
 

@@ -177,6 +177,8 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=50, help="instances for each row (default: 50)")
     parser.add_argument("--steps", type=int, default=20, help="steps that processes go (default: 20)")
     options = parser.parse_args()
+    if options.part == "robot" and Path(options.policy).is_dir():
+        parser.error("the part `robot` also runs the policy with torch: give --policy a name or a .safetensors file")
     with tempfile.TemporaryDirectory() as folder:
         exported = Path(options.policy)
         if not exported.is_dir():

@@ -95,7 +95,7 @@ class RemoteDriver:
         """
         until, newest = time.monotonic() + timeout, None
         while (left := until - time.monotonic()) > 0:
-            if (data := self._inbox.get(0.0 if newest else min(left, 0.2))) is not None:
+            if (data := self._inbox.get(min(left, 0.2) if newest is None else 0.0)) is not None:
                 try:
                     frame = self.seal.unpack(data)
                 except FrameError:  # not of the world: it says nothing about the step
@@ -105,10 +105,10 @@ class RemoteDriver:
                 if frame.content is Content.SENSED:
                     newest = frame.body
             elif newest is not None:
-                return Sensed.from_bytes(newest, self._policy, self._execution)
+                break
             elif self._gone.is_set():
                 raise ConnectionError("the world is gone without having ended")
-        return None
+        return None if newest is None else Sensed.from_bytes(newest, self._policy, self._execution)
 
     def accept(self, step: int, move: int) -> bool | None:
         """Hand a move to the world; False if it refuses, None if no answer came."""

@@ -77,7 +77,11 @@ def launch(tmp_path, name, *, machines=1, victim=-1, when=-1, config=CONFIG):
         )
         for where in placed
     ]
-    errors = [agent.communicate(timeout=300)[1] for agent in agents]
+    try:
+        errors = [agent.communicate(timeout=300)[1] for agent in agents]
+    finally:
+        for agent in agents:
+            agent.kill()
     return [agent.returncode for agent in agents], "".join(errors)
 
 
